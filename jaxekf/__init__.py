@@ -1,0 +1,71 @@
+"""Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
+
+JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
+"""
+
+from jaxekf import manifold, rotation
+from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
+from jaxekf.errors import (
+    FilterError,
+    JaxekfError,
+    ModelError,
+    PrecisionError,
+    RecordingError,
+    TuningError,
+)
+from jaxekf.estimate import estimate, estimate_many
+from jaxekf.interpolation import InputSample
+from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
+from jaxekf.metrics import Score, score
+from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor
+from jaxekf.models import get_model
+from jaxekf.parameters import load as load_parameters
+from jaxekf.parameters import save as save_parameters
+from jaxekf.recording import Encoder, Imu, Optical, Recording, Samples
+from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.storage import load, save
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "SO3",
+    "AdditiveQuaternion",
+    "Belief",
+    "Encoder",
+    "Estimate",
+    "Euclidean",
+    "FilterError",
+    "FilterOutput",
+    "Imu",
+    "Input",
+    "InputSample",
+    "JaxekfError",
+    "Manifold",
+    "Model",
+    "ModelError",
+    "Optical",
+    "Output",
+    "OutputEstimate",
+    "Parameters",
+    "PrecisionError",
+    "Recording",
+    "RecordingError",
+    "Samples",
+    "Score",
+    "Sensor",
+    "SensorRecord",
+    "TuningError",
+    "estimate",
+    "estimate_many",
+    "get_model",
+    "initial_belief",
+    "load",
+    "load_parameters",
+    "manifold",
+    "rotation",
+    "run_filter",
+    "run_filter_batch",
+    "save",
+    "save_parameters",
+    "score",
+]

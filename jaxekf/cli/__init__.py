@@ -1,0 +1,26 @@
+"""The command line: simulate, estimate, tune, plot, demo."""
+
+import click
+import jax
+
+from jaxekf import __version__
+from jaxekf.cli.console import Commands
+from jaxekf.cli.demo import demo
+from jaxekf.cli.estimate import estimate
+from jaxekf.cli.plot import plot
+from jaxekf.cli.simulate import simulate
+from jaxekf.cli.tune import tune
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="jaxekf")
+def main() -> None:
+    """Attitude, rate and bias from recorded runs of an optical tracker and an IMU.
+
+    A run is a folder with recording.toml, optical.csv, imu.csv and, for truth, encoder.csv.
+    """
+    jax.config.update("jax_enable_x64", True)
+
+
+for command in (simulate, estimate, tune, plot, demo):
+    main.add_command(command)

@@ -1,0 +1,110 @@
+"""What the commands share: tables, progress, JSON, and errors as one line."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from jaxekf.errors import JaxekfError
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
+)
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace the output if it exists."
+)
+model_option = click.option(
+    "--model",
+    default="loose",
+    show_default=True,
+    help="loose, loose_rate, loose_additive, or your own as module:attribute.",
+)
+noise_option = click.option(
+    "--noise",
+    "noise_files",
+    multiple=True,
+    type=click.Path(),
+    help="noise.toml, calibration.toml, or a folder that holds them; repeatable.",
+)
+
+
+class Commands(click.Group):
+    """A group whose commands turn the package's own errors into one line and a non-zero exit."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except JaxekfError as error:
+            raise click.ClickException(str(error)) from error
+        except OSError as error:
+            raise click.ClickException(
+                f"{error.filename or 'output'}: got '{error.strerror}', expected to read or write"
+                " there; check the path and its permissions"
+            ) from error
+
+
+def note(text: str) -> None:
+    """A line for the person at the terminal, on standard error."""
+    click.echo(text, err=True)
+
+
+def print_json(document: Any) -> None:
+    """One JSON document on standard output; numbers that are not finite become null."""
+    click.echo(json.dumps(_finite(document), indent=2))
+
+
+def _finite(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {key: _finite(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [_finite(value) for value in node]
+    if isinstance(node, float) and (node != node or node in (float("inf"), float("-inf"))):
+        return None
+    return node
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """A table on standard output; numbers to the right, unknown ones as a dash."""
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for i, column in enumerate(columns):
+        numeric = bool(rows) and isinstance(rows[0][i], float | int)
+        table.add_column(column, justify="right" if numeric else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*[_cell(value) for value in row])
+    wide = None if sys.stdout.isatty() else 120
+    Console(width=wide).print(table)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "–" if value != value else f"{value:.3f}"
+    return str(value)
+
+
+@contextmanager
+def tuning_progress(iterations: int) -> Iterator[Callable[[Any, int], None]]:
+    """A progress bar for the tuner on a terminal's standard error; silent in a pipe."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("tuning: compiling", total=iterations)
+
+        def report(step: Any, total: int) -> None:
+            held = (
+                "" if step.validation != step.validation else f", validation {step.validation:.5g}"
+            )
+            text = "rejected step" if step.rejected else f"tuning: {step.training:.5g}{held}"
+            bar.update(task, completed=step.number + 1, total=total, description=text)
+
+        yield report

@@ -1,0 +1,84 @@
+"""`jaxekf demo`: the main job on the bundled recordings, from tuning to pictures."""
+
+import json
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+
+import tuning
+from jaxekf.cli.console import json_option, note, print_json, tuning_progress
+from jaxekf.cli.plot import FIGURES, draw
+from jaxekf.cli.tune import print_comparison
+from jaxekf.datasets import demo as runs
+from jaxekf.errors import RecordingError
+from jaxekf.models import get_model
+from jaxekf.parameters import as_arrays
+from jaxekf.storage import load, write_whole
+from tuning.validation import as_dicts
+
+# What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
+_HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
+_ITERATIONS = 20
+
+
+@click.command()
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True
+)
+@json_option
+def demo(output: Path, as_json: bool) -> None:
+    """Tune on some bundled runs, estimate the others, and write tables, estimates and figures.
+
+    The recordings come from the package's own simulator. A demo folder of an earlier call is replaced.
+    """
+    if output.exists() and not (output / "demo.json").is_file():
+        raise RecordingError(
+            output, "a path that exists and is no demo", "a new one", "another output"
+        )
+    began = time.perf_counter()
+    model = get_model("loose")
+    hand_set = as_arrays(model.parameters)
+    deviations = {name: np.deg2rad(value) for name, value in _HAND_SET_DEG.items()}
+    hand_set = as_arrays(hand_set._replace(noise=hand_set.noise._replace(**deviations)))
+    training, validation, testing = (
+        [load(path) for path in runs.paths(names)]
+        for names in (runs.TRAINING, runs.VALIDATION, runs.TESTING)
+    )
+    note(f"tuning on {', '.join(runs.TRAINING)}; validating on {', '.join(runs.VALIDATION)}")
+    with tuning_progress(_ITERATIONS) as progress:
+        tuned = tuning.tune(
+            training,
+            validate=validation,
+            start=hand_set,
+            objective=tuning.attitude_error() + 0.01 * tuning.innovation_likelihood(),
+            iterations=_ITERATIONS,
+            progress=progress,
+        )
+    note(f"estimating {', '.join(runs.TESTING)}")
+    compared = tuning.compare(model, testing, {"hand-set": hand_set, "tuned": tuned.params})
+    tuned.save(output)
+    figures = []
+    for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
+        made.save(output / "result" / recording.name, overwrite=True)
+        chosen = FIGURES if recording.name == "constant-rate" else ("attitude", "occlusion")
+        figures += draw(made, recording, output / "figures", chosen)
+    document = {
+        "rows": as_dicts(compared.rows),
+        "mean_attitude_rmse_deg": tuning.mean_by_variant(compared.rows),
+        "noise_deg": {
+            name: float(np.rad2deg(value)) for name, value in tuned.params.noise._asdict().items()
+        },
+        "figures": [str(file) for file in figures],
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    write_whole(output / "demo.json", json.dumps(document, indent=2) + "\n")
+    if as_json:
+        print_json(document)
+        return
+    print_comparison("Runs the tuner has not seen", compared.rows)
+    for name, value in document["noise_deg"].items():
+        unit = model.units.noise._asdict()[name].replace("rad", "deg", 1)
+        click.echo(f"  {name:<10} {_HAND_SET_DEG[name]:>7} -> {value:.4f} {unit}")
+    click.echo(f"noise, estimates and figures are in {output}/ ({document['seconds']} s)")

@@ -1,0 +1,105 @@
+"""`jaxekf estimate`: attitude, rate and bias of recorded runs."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from jaxekf import metrics, parameters, storage
+from jaxekf.cli.console import (
+    json_option,
+    model_option,
+    noise_option,
+    note,
+    overwrite_option,
+    print_json,
+    print_table,
+)
+from jaxekf.errors import RecordingError
+from jaxekf.estimate import estimate_many
+from jaxekf.models import get_model
+from jaxekf.recording import Recording
+from jaxekf.result import Estimate
+
+
+def load_runs(paths: Sequence[Path]) -> list[Recording]:
+    """Read runs; each must have a name of its own, since results are named after them."""
+    recordings = [storage.load(path) for path in paths]
+    names = [recording.name for recording in recordings]
+    for path, name in zip(paths, names, strict=True):
+        if names.count(name) > 1:
+            raise RecordingError(
+                path, f"the name '{name}' twice", "runs with different names", "renaming one"
+            )
+    return recordings
+
+
+def describe(made: Estimate, recording: Recording) -> dict[str, Any]:
+    """Summary of one estimate, with its score where there is an encoder."""
+    summary = made.summary()
+    summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
+    summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
+    if recording.encoder is not None:
+        summary["score"] = metrics.score(made, recording).as_dict()
+        summary["hold_last_deg"] = metrics.score_hold_last(recording, made.time_ns)
+    return summary
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@model_option
+@noise_option
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("result"), show_default=True
+)
+@overwrite_option
+@json_option
+def estimate(
+    runs: tuple[Path, ...],
+    model: str,
+    noise_files: tuple[str, ...],
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Estimate RUNS and write a result folder for each under the output."""
+    chosen = get_model(model)
+    params = parameters.load(chosen, *noise_files)
+    recordings = load_runs(runs)
+    estimates = estimate_many(recordings, chosen, params)
+    summaries = []
+    for made, recording in zip(estimates, recordings, strict=True):
+        folder = made.save(output / recording.name, overwrite=overwrite)
+        summaries.append(describe(made, recording) | {"result": str(folder)})
+        note(f"wrote {folder}")
+    if as_json:
+        print_json({"model": chosen.name, "runs": summaries})
+        return
+    rows = [_row(summary) for summary in summaries]
+    columns = [
+        "run",
+        "seconds",
+        "attitude RMSE (deg)",
+        "rate RMSE (deg/s)",
+        "NEES",
+        "tracker NIS",
+        "masked",
+    ]
+    print_table(f"Estimates by {chosen.name}", columns, rows)
+
+
+def _row(summary: dict[str, Any]) -> list[Any]:
+    judged = summary.get("score", {})
+    nan = float("nan")
+    account = summary["account"].get("optical", {})
+    return [
+        summary["run"],
+        summary["duration_s"],
+        judged.get("attitude_rmse_deg", nan),
+        judged.get("rate_rmse_deg_s", nan),
+        judged.get("attitude_nees", nan),
+        summary["mean_nis"].get("optical", nan),
+        f"{account.get('masked', 0)} of {account.get('read', 0)}",
+    ]

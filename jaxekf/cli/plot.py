@@ -1,0 +1,61 @@
+"""`jaxekf plot`: the figures of recorded runs."""
+
+from pathlib import Path
+
+import click
+
+from jaxekf import parameters, plots
+from jaxekf.cli.console import json_option, model_option, noise_option, note, print_json
+from jaxekf.cli.estimate import load_runs
+from jaxekf.estimate import estimate_many
+from jaxekf.models import get_model
+from jaxekf.recording import Recording
+from jaxekf.result import Estimate
+
+FIGURES = tuple(plots.figure_functions())
+
+
+def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]) -> list[Path]:
+    """Write the named figures of one run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    functions = plots.figure_functions()
+    return [
+        plots.save(functions[name](made, recording), folder / f"{made.run}_{name}.png")
+        for name in names
+    ]
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--figure",
+    "figures",
+    multiple=True,
+    type=click.Choice(FIGURES),
+    help="Which; repeatable.  [default: all]",
+)
+@model_option
+@noise_option
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("figures"), show_default=True
+)
+@json_option
+def plot(
+    runs: tuple[Path, ...],
+    figures: tuple[str, ...],
+    model: str,
+    noise_files: tuple[str, ...],
+    output: Path,
+    as_json: bool,
+) -> None:
+    """Estimate RUNS and draw attitude, rate, bias, the longest occlusion and the path of a marker."""
+    chosen = get_model(model)
+    recordings = load_runs(runs)
+    estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
+    files: list[Path] = []
+    for made, recording in zip(estimates, recordings, strict=True):
+        files += draw(made, recording, output, figures or FIGURES)
+    for file in files:
+        note(f"wrote {file}")
+    if as_json:
+        print_json({"figures": [str(file) for file in files]})

@@ -1,0 +1,173 @@
+"""`jaxekf tune`: noise, and calibration where asked, from recorded runs."""
+
+from pathlib import Path
+
+import click
+import jax
+import numpy as np
+
+import tuning
+from jaxekf import parameters
+from jaxekf.cli.console import (
+    json_option,
+    model_option,
+    noise_option,
+    note,
+    print_json,
+    print_table,
+    tuning_progress,
+)
+from jaxekf.cli.estimate import load_runs
+from jaxekf.models import get_model
+from tuning.noise import AXES
+from tuning.objectives import parse
+from tuning.validation import as_dicts
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--validate",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="A run the tuner does not learn from but is judged by; repeatable.",
+)
+@model_option
+@noise_option
+@click.option(
+    "--objective",
+    default="attitude",
+    show_default=True,
+    help="attitude, rate, likelihood, or a weighted sum such as attitude+0.1*likelihood.",
+)
+@click.option(
+    "--free",
+    multiple=True,
+    help="What may change: noise, calibration, initial or one leaf; repeatable.  [default: noise]",
+)
+@click.option(
+    "--axes",
+    type=click.Choice(AXES),
+    default="tied",
+    show_default=True,
+    help="One deviation for all axes, one for each, or a full matrix.",
+)
+@click.option("--iterations", type=click.IntRange(1), default=60, show_default=True)
+@click.option(
+    "--patience",
+    type=click.IntRange(1),
+    default=15,
+    show_default=True,
+    help="Iterations without improvement before stopping.",
+)
+@click.option(
+    "--burn-in",
+    type=click.FloatRange(0.0),
+    default=0.0,
+    show_default=True,
+    help="Seconds at the start of each run that do not count.",
+)
+@click.option(
+    "--rescale/--no-rescale",
+    default=None,
+    help="Scale Q, R and P0 so that errors match them.  [default: unless the likelihood counts]",
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
+)
+@json_option
+def tune(
+    runs: tuple[Path, ...],
+    validate: tuple[Path, ...],
+    model: str,
+    noise_files: tuple[str, ...],
+    objective: str,
+    free: tuple[str, ...],
+    axes: str,
+    iterations: int,
+    patience: int,
+    burn_in: float,
+    rescale: bool | None,
+    output: Path,
+    as_json: bool,
+) -> None:
+    """Tune on RUNS and write noise.toml and calibration.toml.
+
+    --noise gives the start; the model's defaults otherwise.
+    """
+    chosen = get_model(model)
+    start = parameters.load(chosen, *noise_files)
+    training, held_out = load_runs(runs), load_runs(validate)
+    aim = parse(objective)
+    with tuning_progress(iterations) as progress:
+        tuned = tuning.tune(
+            training,
+            validate=held_out,
+            model=chosen,
+            objective=aim,
+            free=list(free) or None,
+            start=start,
+            axes=axes,
+            iterations=iterations,
+            patience=patience,
+            burn_in_s=burn_in,
+            rescale=rescale,
+            progress=progress,
+        )
+    tuned.save(output)
+    note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
+    if tuned.rejections:
+        note(f"{tuned.rejections} steps were not finite and were rejected")
+    judged = held_out or training
+    scored = [run for run in judged if run.encoder is not None]
+    rows = []
+    if scored:
+        rows = tuning.compare(chosen, scored, {"start": start, "tuned": tuned.params}).rows
+    if as_json:
+        document = parameters.to_document(chosen, tuned.params, tuned.origin)
+        print_json(document | {"rows": as_dicts(rows), "rejected_steps": tuned.rejections})
+        return
+    _print_noise(tuned)
+    if rows:
+        on = "validation runs" if held_out else "the training runs themselves"
+        print_comparison(f"On {on}", rows)
+
+
+def _print_noise(tuned: tuning.Tuned) -> None:
+    units = dict(
+        zip(
+            parameters.leaf_names(tuned.model.units),
+            jax.tree.leaves(tuned.model.units),
+            strict=True,
+        )
+    )
+    names = parameters.leaf_names(tuned.params)
+    before = jax.tree.leaves(tuned.start)
+    after = jax.tree.leaves(tuned.params)
+    rows = []
+    for name, old, new in zip(names, before, after, strict=True):
+        if np.array_equal(old, new):
+            continue
+        unit = units[name]
+        turn = np.rad2deg if unit.startswith("rad") else np.asarray
+        shown = unit.replace("rad", "deg", 1)
+        rows.append([name, _short(turn(old)), _short(turn(new)), shown])
+    print_table("Tuned parameters", ["parameter", "start", "tuned", "unit"], rows)
+
+
+def _short(value: object) -> str:
+    array = np.asarray(value, float)
+    if array.ndim == 0:
+        return f"{float(array):.5g}"
+    return np.array2string(array, precision=4, separator=" ").replace("\n", "")
+
+
+def print_comparison(title: str, rows: list[tuning.Row]) -> None:
+    """The table that sets variants beside each other, run by run and on average."""
+    columns = ["run", "noise", "attitude RMSE (deg)", "rate RMSE (deg/s)", "tracker NIS", "NEES"]
+    shown = [list(row) for row in rows]
+    fields = ("attitude_rmse_deg", "rate_rmse_deg_s", "nis", "nees")
+    means = {field: tuning.mean_by_variant(rows, field) for field in fields}
+    for variant in dict.fromkeys(row.variant for row in rows):
+        shown.append(["mean", variant, *(means[field][variant] for field in fields)])
+    print_table(title, columns, shown)

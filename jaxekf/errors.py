@@ -1,0 +1,41 @@
+"""Errors a caller can meet. Each message says what was got, what was expected and what to do."""
+
+from pathlib import Path
+
+
+class JaxekfError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class RecordingError(JaxekfError):
+    """A recorded run cannot be read, or does not hold what its description says."""
+
+    def __init__(
+        self,
+        path: Path | str,
+        got: str,
+        expected: str,
+        hint: str,
+        *,
+        line: int | None = None,
+        column: str | None = None,
+    ) -> None:
+        self.path, self.line, self.column = Path(path), line, column
+        place = ":".join(str(part) for part in (path, line, column) if part is not None)
+        super().__init__(f"{place}: got {got}, expected {expected}; try {hint}")
+
+
+class ModelError(JaxekfError):
+    """A model is unknown, malformed, or does not fit the recording."""
+
+
+class PrecisionError(JaxekfError):
+    """JAX is running in float32, in which the covariance recursion is not trustworthy."""
+
+
+class FilterError(JaxekfError):
+    """The recursion lost finiteness or definiteness; the message names run, step, time and sensor."""
+
+
+class TuningError(JaxekfError):
+    """A tuning problem is ill-posed or could not be started."""

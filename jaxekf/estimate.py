@@ -1,0 +1,219 @@
+"""From recorded runs to estimates: the host's side of the filter."""
+
+from collections.abc import Sequence
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import ekf, manifold, parameters, storage, timeline
+from jaxekf.ekf import FilterOutput
+from jaxekf.errors import FilterError, PrecisionError
+from jaxekf.model import Belief, Model, Parameters
+from jaxekf.models import get_model
+from jaxekf.recording import NANOSECONDS, Recording
+from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.timeline import Steps, Timeline
+
+Run = Recording | Path | str
+
+
+def require_float64() -> None:
+    """Raise `PrecisionError` where JAX is not set to float64."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise PrecisionError(
+            "got JAX in float32, expected float64; call jax.config.update('jax_enable_x64', True)"
+            " before the first array, or set JAX_ENABLE_X64=1"
+        )
+
+
+def estimate(run: Run, model: str | Model = "loose", params: Parameters | None = None) -> Estimate:
+    """Estimate one run: a `Recording` or the path of a recorded folder.
+
+    `model` is a name, ``module:attribute`` or a `Model`; `params` are the model's defaults unless
+    given (see `jaxekf.load_parameters`). Raises `RecordingError` for what is wrong with the data,
+    `FilterError` where the recursion broke, `PrecisionError` in float32.
+    """
+    return estimate_many([run], model, params)[0]
+
+
+def estimate_many(
+    runs: Sequence[Run], model: str | Model = "loose", params: Parameters | None = None
+) -> list[Estimate]:
+    """Estimate several runs side by side with the same parameters; equal to one call for each."""
+    require_float64()
+    chosen = get_model(model)
+    recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+    timelines = timeline.build_many(chosen, recordings)
+    used = parameters.as_arrays(chosen.parameters if params is None else params)
+    firsts = [line.first for line in timelines]
+    results = filter_timelines(chosen, used, firsts, timelines)
+    return [
+        _collect(chosen, used, recording, line, *result)
+        for recording, line, result in zip(recordings, timelines, results, strict=True)
+    ]
+
+
+def filter_timelines(
+    model: Model, params: Parameters, firsts: Sequence[dict[str, Any]], lines: Sequence[Timeline]
+) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
+    """Filter runs in one compiled call, padded to a common length out of a few, and check it."""
+    steps = bucketed(lines)
+    means = [model.initial_mean(first) for first in firsts]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
+    output, outputs = _run(model, params, stacked, steps)
+    output, outputs = jax.tree.map(np.asarray, (output, outputs))
+    results = []
+    for i, line in enumerate(lines):
+        one = jax.tree.map(lambda a, i=i: a[i], (output, outputs))
+        results.append(one)
+        _check(model, line, one[0])
+    return results
+
+
+def bucketed(lines: Sequence[Timeline]) -> Steps:
+    """Stacked steps, padded to one of a few lengths so that few programs are ever compiled."""
+    steps = timeline.stack(list(lines))
+    runs, epochs, substeps = steps.dt.shape
+    longer = timeline.bucket(epochs)
+    knots = None if steps.knots is None else timeline.bucket(steps.knots.time.shape[1])
+    ones = [jax.tree.map(lambda a, i=i: a[i], steps) for i in range(runs)]
+    padded = [timeline.pad(one, longer, substeps, knots) for one in ones]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+
+
+@partial(jax.jit, static_argnums=0)
+def _run(model: Model, params: Parameters, means: Any, steps: Steps) -> Any:
+    runs = steps.dt.shape[0]
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    cov = jax.vmap(model.initial_covariance)(every)
+    output = ekf.run_filter_batch(model, every, Belief(means, cov), steps)
+    return output, evaluate_outputs(model, every, output)
+
+
+def evaluate_outputs(
+    model: Model, params: Parameters, output: FilterOutput
+) -> dict[str, tuple[Any, Array]]:
+    """Value and covariance of each of the model's outputs, leading axes (runs, K, S)."""
+
+    def one(params: Parameters, belief: Belief, u: Any) -> dict[str, tuple[Any, Array]]:
+        found = {}
+        for out in model.outputs:
+            value = out.value(belief.mean, u, params)
+
+            def error(delta: Array, out: Any = out, value: Any = value) -> Array:
+                change = manifold.lift(model.space, belief.mean, delta)
+                moved = jax.jvp(lambda x: out.value(x, u, params), (belief.mean,), (change,))[1]
+                return manifold.lower(out.space, value, moved)
+
+            jacobian = jax.vmap(error, out_axes=1)(jnp.eye(model.error_dim))
+            cov = jacobian @ belief.cov @ jacobian.T
+            if out.noise is not None:
+                cov = cov + out.noise(u, params)
+            found[out.name] = (value, 0.5 * (cov + cov.T))
+        return found
+
+    over_steps = jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
+    return jax.vmap(over_steps)(params, output.instants.updated, output.inputs)
+
+
+def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
+    """Raise for the first substep at which the recursion broke."""
+    epochs, substeps = line.time_ns.shape
+    healthy = np.asarray(output.instants.healthy)[:epochs, -substeps:]
+    broken = np.argwhere(~healthy & line.valid)
+    if broken.size == 0:
+        return
+    k, s = (int(i) for i in broken[0])
+    seconds = (line.time_ns[k, s] - line.time_ns[0, -1]) / NANOSECONDS
+    blamed = []
+    for name in model_sensors(line):
+        innovation = output.innovations[name]
+        index = (k, s) if name in line.steps.fast else (k,)
+        diagonal = np.diagonal(np.asarray(innovation.cov)[index])
+        if not np.all(np.isfinite(diagonal) & (diagonal > 0.0)):
+            blamed.append(name)
+    raise FilterError(
+        f"run '{line.name}': got a covariance that is not finite and definite at step {k * substeps + s},"
+        f" {seconds:.6f} s, sensor {' and '.join(blamed) or 'none (prediction)'} of model"
+        f" '{model.name}', expected a definite one; look for wrong units in the data or noise that is"
+        " zero, negative or not finite"
+    )
+
+
+def model_sensors(line: Timeline) -> list[str]:
+    """Names of all sensors of a timeline."""
+    return [*line.steps.fast, *line.steps.slow]
+
+
+def _collect(
+    model: Model,
+    params: Parameters,
+    recording: Recording,
+    line: Timeline,
+    output: FilterOutput,
+    outputs: dict[str, Any],
+) -> Estimate:
+    """The filter's arrays without padding, in order of time."""
+    epochs, substeps = line.time_ns.shape
+    valid = line.valid
+
+    def flat(array: Any) -> Any:
+        return np.asarray(array)[:epochs, -substeps:][valid]
+
+    belief: Belief = jax.tree.map(flat, output.instants.updated)
+    sensors, account = {}, {name: dict(count) for name, count in line.account.items()}
+    for name in model_sensors(line):
+        fast = name in line.steps.fast
+        rows = (line.steps.fast if fast else line.steps.slow)[name]
+        record = _sensor_record(output.innovations[name], rows, line, fast)
+        sensors[name] = record
+        if name in account:
+            rejected = int((record.gated.any(axis=1) & ~record.used.any(axis=1)).sum())
+            account[name]["gated"] = rejected
+            account[name]["used"] = account[name].pop("fed") - rejected
+    named = {}
+    for name, (value, cov) in outputs.items():
+        out = model.output(name)
+        unit = manifold.error_units(out.space)[0]
+        named[name] = OutputEstimate(flat(value), flat(cov), out.frame, unit)
+    total = float(flat(output.instants.log_likelihood).sum())
+    return Estimate(
+        run=recording.name,
+        model=model,
+        time_ns=line.time_ns[valid],
+        state=belief.mean,
+        cov=np.asarray(belief.cov),
+        outputs=named,
+        sensors=sensors,
+        log_likelihood=total,
+        account=account,
+        params=params,
+        provenance=provenance() | {"recording": str(recording.path or recording.name)},
+    )
+
+
+def _sensor_record(innovation: Any, rows: Any, line: Timeline, fast: bool) -> SensorRecord:
+    """One sensor's innovations at the instants at which it was sampled and seen."""
+    epochs, substeps = line.time_ns.shape
+    parts = jax.tree.map(
+        lambda a: np.asarray(a)[:epochs, -substeps:] if fast else np.asarray(a)[:epochs], innovation
+    )
+    times = line.time_ns if fast else line.time_ns[:, -1]
+    seen = np.asarray(rows.mask).any(axis=-1)
+    return SensorRecord(times[seen], *(part[seen] for part in parts))
+
+
+def provenance() -> dict[str, Any]:
+    """Versions and settings that an estimate was made with."""
+    names = ("jaxekf", "jax", "jaxlib", "numpy", "optax")
+    return {
+        "versions": {name: version(name) for name in names},
+        "dtype": "float64",
+        "backend": jax.default_backend(),
+    }

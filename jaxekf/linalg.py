@@ -1,0 +1,121 @@
+"""Small dense linear algebra for the filter: sizes are static and tiny, so loops are unrolled.
+
+Inside a ``lax.scan`` on a CPU a call to LAPACK, or a tiny ``dot``, costs far more than its
+arithmetic; these functions are plain arithmetic which XLA fuses. Matrices stand on the **first** axes;
+whatever axes follow are *lanes*: independent problems, usually runs, side by side in memory.
+"""
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+def symmetrise(matrix: Array) -> Array:
+    """The symmetric part, (n, n, ...)."""
+    return 0.5 * (matrix + matrix.swapaxes(0, 1))
+
+
+def multiply(left: Array, right: Array) -> Array:
+    """Matrix product, shapes (i, k, ...), (k, j, ...) to (i, j, ...)."""
+    return jnp.sum(left[:, :, None] * right[None], axis=1)
+
+
+def multiply_transposed(left: Array, right: Array) -> Array:
+    """``left @ right.T``, shapes (i, k, ...), (j, k, ...) to (i, j, ...)."""
+    return jnp.sum(left[:, None] * right[None], axis=2)
+
+
+def apply(matrix: Array, vector: Array) -> Array:
+    """Matrix times vector, shapes (i, k, ...), (k, ...) to (i, ...)."""
+    return jnp.sum(matrix * vector[None], axis=1)
+
+
+def outer(left: Array, right: Array) -> Array:
+    """Outer product, shapes (i, ...), (j, ...) to (i, j, ...)."""
+    return left[:, None] * right[None]
+
+
+def diagonal(matrix: Array) -> Array:
+    """Diagonal, (n, n, ...) to (n, ...)."""
+    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
+
+
+def identity_like(matrix: Array) -> Array:
+    """The identity broadcast to the shape (n, n, ...) of `matrix`."""
+    size = matrix.shape[0]
+    eye = jnp.eye(size, dtype=matrix.dtype).reshape((size, size) + (1,) * (matrix.ndim - 2))
+    return jnp.broadcast_to(eye, matrix.shape)
+
+
+def standard_deviation_factor(deviation: Array, dim: int) -> Array:
+    """Lower factor ``L`` (dim, dim), ``L @ L.T`` the covariance, of a noise parameter.
+
+    A noise parameter is a standard deviation for all axes, shape (); one for each axis, shape
+    (dim,); or already a lower-triangular factor, shape (dim, dim). What lies above the diagonal of
+    a factor is ignored.
+    """
+    deviation = jnp.asarray(deviation)
+    if deviation.ndim == 0:
+        return deviation * jnp.eye(dim, dtype=deviation.dtype)
+    if deviation.shape == (dim,):
+        return jnp.diag(deviation)
+    if deviation.shape == (dim, dim):
+        return jnp.tril(deviation)
+    raise ValueError(
+        f"got a noise parameter of shape {deviation.shape}, expected (), ({dim},) or ({dim}, {dim});"
+        " give one standard deviation, one for each axis, or a lower-triangular factor"
+    )
+
+
+def covariance(deviation: Array, dim: int) -> Array:
+    """Covariance (dim, dim) of a noise parameter, see `standard_deviation_factor`."""
+    factor = standard_deviation_factor(deviation, dim)
+    return factor @ factor.T
+
+
+def mask_covariance(matrix: Array, mask: Array) -> Array:
+    """``matrix`` with hidden rows and columns replaced by those of the identity, (m, m, ...), (m, ...).
+
+    What is left is exactly the visible sub-block, so that a factor of it whitens the visible rows
+    as if the hidden ones had never been there, correlations included.
+    """
+    both = mask[:, None] & mask[None, :]
+    return jnp.where(both, matrix, identity_like(matrix))
+
+
+def whitener(matrix: Array) -> tuple[Array, Array]:
+    """Lower Cholesky factor of a small positive definite matrix, and one over its diagonal.
+
+    Shapes (m, m, ...) to (m, m, ...), (m, ...). NaN where the matrix is not definite.
+    """
+    size = matrix.shape[0]
+    rows: list[list[Array]] = []
+    inverses: list[Array] = []
+    for i in range(size):
+        row: list[Array] = []
+        for j in range(i + 1):
+            value = matrix[i, j]
+            for k in range(j):
+                value = value - row[k] * (row[k] if j == i else rows[j][k])
+            if j < i:
+                row.append(value * inverses[j])
+                continue
+            inverses.append(lax.rsqrt(value))
+            row.append(value * inverses[i])
+        rows.append(row)
+    zero = jnp.zeros_like(matrix[0, 0])
+    factor = jnp.stack([jnp.stack(row + [zero] * (size - len(row))) for row in rows])
+    return factor, jnp.stack(inverses)
+
+
+def whiten(white: tuple[Array, Array], right: Array) -> Array:
+    """``inv(factor) @ right`` with what `whitener` returned, right (m, ...) or (m, n, ...)."""
+    factor, inverses = white
+    if right.ndim == factor.ndim:
+        factor, inverses = factor[:, :, None], inverses[:, None]
+    solved: list[Array] = []
+    for i in range(factor.shape[0]):
+        value = right[i]
+        for k in range(i):
+            value = value - factor[i, k] * solved[k]
+        solved.append(value * inverses[i])
+    return jnp.stack(solved)

@@ -1,0 +1,160 @@
+"""What an estimator is told: models and sensors as data.
+
+A model is a state space, a transition with its process noise, sensors, outputs and default
+parameters. It is written for one run, one step and one sample; the filter differentiates it, scans
+it over time and maps it over runs. Nothing here knows a particular model.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from jax import Array
+
+from jaxekf import manifold
+from jaxekf.errors import ModelError
+from jaxekf.recording import Recording, Samples
+
+Transition = Callable[[Any, Any, Array, Array, "Parameters"], Any]
+ProcessNoise = Callable[["Parameters", Array], Array]
+Predict = Callable[[Any, Any, "Parameters", Any], Any]
+SensorNoise = Callable[["Parameters", Any, Array], Array]
+Source = Callable[[Recording], Samples]
+
+
+class Parameters(NamedTuple):
+    """Everything a run is estimated with that is not data: pytrees of arrays, so they have gradients."""
+
+    noise: Any
+    """Standard deviations or spectral densities; shape () for all axes, (d,) for each axis, or a
+    lower-triangular factor (d, d)."""
+    calibration: Any
+    """Clock offset, alignment, scale, lever arm, latency: what is not noise."""
+    initial: Any
+    """Standard deviations of the initial belief."""
+
+
+class Belief(NamedTuple):
+    """A state and the covariance of its error vector (in the tangent space at the mean)."""
+
+    mean: Any
+    cov: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """One kind of measurement.
+
+    ``measured = retract(predict(x, u, params, aux), noise)`` in the space of the measurement.
+    """
+
+    name: str
+    space: Any
+    """Manifold (or NamedTuple of manifolds) of one sample; its error vector has one entry a row."""
+    predict: Predict
+    """``predict(x, u, params, aux)``: the sample without noise; ``u`` is an `InputSample`."""
+    noise: SensorNoise
+    """``noise(params, aux, dt)``: covariance (rows, rows) of a sample; ``dt`` is the time in seconds
+    since the sensor's previous sample."""
+    source: Source | None = None
+    """Where a recording holds the samples; None for a sensor that is fed from arrays only."""
+    groups: tuple[int, ...] | None = None
+    """Group of each row; a gate accepts or rejects a group whole. None puts all rows in one group."""
+    gate: float | None = None
+    """Probability with which a good group passes the chi-square gate; None for no gate."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of one sample."""
+        return manifold.error_dim(self.space)
+
+    @property
+    def group_rows(self) -> tuple[tuple[int, ...], ...]:
+        """Rows of each group."""
+        groups = self.groups or (0,) * self.rows
+        return tuple(
+            tuple(row for row, group in enumerate(groups) if group == name)
+            for name in sorted(set(groups))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """A quantity users ask for that follows from the state, with its uncertainty."""
+
+    name: str
+    space: Any
+    frame: str
+    """Frame in which the error vector, and so the covariance, is counted."""
+    value: Callable[[Any, Any, Parameters], Any]
+    """``value(x, u, params)``; ``u`` is the input at that instant."""
+    noise: Callable[[Any, Parameters], Array] | None = None
+    """``noise(u, params)``: covariance added by what is not in the state, such as a gyroscope sample's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Input:
+    """A measured quantity that drives the transition instead of being compared with it."""
+
+    name: str
+    source: Source
+    clock_offset: Callable[[Parameters], Array] | None = None
+    """Seconds to add to a time of the timeline to get the input's own clock."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A system to be estimated. Instances are compared by identity: build each once."""
+
+    name: str
+    summary: str
+    space: Any
+    transition: Transition
+    """``transition(x, u, dt, w, params)``: the state ``dt`` seconds later; ``u`` is the mean of the
+    input over the step (None without input) and ``w`` the process noise integrated over it."""
+    process_noise: ProcessNoise
+    """``process_noise(params, dt)``: covariance (n_w, n_w) of ``w``; zero at ``dt = 0``."""
+    sensors: tuple[Sensor, ...]
+    parameters: Parameters
+    """Defaults."""
+    units: Parameters
+    """Unit of each parameter, as strings in the same trees."""
+    noise_dims: Any
+    """Number of axes of each noise parameter, in the same tree as `parameters.noise`."""
+    initial_mean: Callable[[Mapping[str, Any]], Any]
+    """``initial_mean(first)``: the state at the start from the first visible sample of each sensor."""
+    initial_covariance: Callable[[Parameters], Array]
+    start_with: tuple[str, ...] = ()
+    """Sensors that must have been seen before the run can start."""
+    input: Input | None = None
+    outputs: tuple[Output, ...] = ()
+    project: Callable[[Any], Any] | None = None
+    """Puts an updated mean back on a constraint that its space does not keep; None where it does."""
+    hold_to: str | None = None
+    """Name of the sensor on whose sampling instants every other stream is held (zero-order), as the
+    published discrete-time filter does; None takes every sample at its own time."""
+
+    @property
+    def error_dim(self) -> int:
+        """Length of the error vector, the size of every covariance."""
+        return manifold.error_dim(self.space)
+
+    def sensor(self, name: str) -> Sensor:
+        """The sensor called `name`."""
+        for sensor in self.sensors:
+            if sensor.name == name:
+                return sensor
+        raise ModelError(
+            f"model '{self.name}' got the sensor name '{name}', expected one of"
+            f" {[s.name for s in self.sensors]}; check the spelling"
+        )
+
+    def output(self, name: str) -> Output:
+        """The output called `name`."""
+        for output in self.outputs:
+            if output.name == name:
+                return output
+        raise ModelError(
+            f"model '{self.name}' got the output name '{name}', expected one of"
+            f" {[o.name for o in self.outputs]}; check the spelling"
+        )

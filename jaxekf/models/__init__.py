@@ -1,0 +1,46 @@
+"""The models that come with the package, by name. Adding one is a file here and a line below."""
+
+import importlib
+import os
+import sys
+
+from jaxekf.errors import ModelError
+from jaxekf.model import Model
+from jaxekf.models import loose, loose_additive, loose_rate
+
+REGISTRY: dict[str, Model] = {
+    model.name: model for model in (loose.MODEL, loose_rate.MODEL, loose_additive.MODEL)
+}
+
+
+def get_model(model: str | Model) -> Model:
+    """A model by its name, by ``module:attribute``, or itself.
+
+    ``module`` is imported as Python would from the current directory. Raises `ModelError` where there
+    is no such model.
+    """
+    if isinstance(model, Model):
+        return model
+    if model in REGISTRY:
+        return REGISTRY[model]
+    if ":" not in model:
+        raise ModelError(
+            f"got the model '{model}', expected one of {sorted(REGISTRY)} or module:attribute;"
+            " check the spelling"
+        )
+    module_name, attribute = model.split(":", 1)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        found = getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ModelError(
+            f"got the model '{model}', expected an importable module with that attribute ({error});"
+            " check the name and the folder you are in"
+        ) from error
+    if not isinstance(found, Model):
+        raise ModelError(
+            f"got '{model}' of type {type(found).__name__}, expected a jaxekf.Model;"
+            " name the attribute that holds the model"
+        )
+    return found

@@ -1,0 +1,155 @@
+"""`loose`: attitude and gyroscope bias, the gyroscope as input, the tracker's attitude as measurement.
+
+The recommended model of Cheng's (2023) system: 6 degrees of freedom, error-state attitude, body
+rates. The gyroscope drives the prediction at its own rate, so that nothing is held and nothing about
+the motion needs to be assumed.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, rotation
+from jaxekf.interpolation import InputSample
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.models import sources
+
+
+class State(NamedTuple):
+    """Attitude of the tool in the tracker's reference frame, and bias of its gyroscope."""
+
+    q_ref_body: Any
+    bias: Any
+
+
+class Noise(NamedTuple):
+    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+
+    gyroscope: Any
+    """White noise of the rate, spectral density."""
+    bias_walk: Any
+    """Random walk of the bias, spectral density of its derivative."""
+    optical: Any
+    """The tracker's attitude, standard deviation of a sample, body frame."""
+
+
+class Calibration(NamedTuple):
+    """What is not random: ``rate = gyroscope_matrix @ (measured - bias - noise)``."""
+
+    gyroscope_matrix: Any
+    """Scale, non-orthogonality and alignment of the gyroscope to the tool's frame, (3, 3)."""
+    clock_offset: Any
+    """Seconds to add to the tracker's time to get the IMU's, positive where the IMU lags; ()."""
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    attitude: Any
+    """About the first visible tracker sample, which is then used as a measurement: keep it wide."""
+    bias: Any
+    """About zero."""
+
+
+SPACE: Any = State(SO3(), Euclidean(3, "rad/s"))
+
+
+def _rate(x: State, measured: Array, params: Parameters) -> Array:
+    return params.calibration.gyroscope_matrix @ (measured - x.bias)
+
+
+def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
+    """``q exp(rate dt + w_angle)`` and ``bias + w_bias``."""
+    turn = _rate(x, u.mean, params) * dt + w[:3]
+    return State(SO3().retract(x.q_ref_body, turn), x.bias + w[3:])
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (6, 6) of the angle and bias noise over ``dt``.
+
+    Exact for the double integrator, so that cutting a step in two changes nothing: the bias walks
+    while it is being integrated.
+    """
+    white = linalg.covariance(params.noise.gyroscope, 3) * dt
+    walk = linalg.covariance(params.noise.bias_walk, 3)
+    cross = -0.5 * walk * dt**2
+    return jnp.block([[white + walk * dt**3 / 3.0, cross], [cross, walk * dt]])
+
+
+def predict_optical(x: State, u: Any, params: Parameters, aux: Any) -> Array:
+    """The tracker sees the attitude itself."""
+    return x.q_ref_body
+
+
+def optical_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of a tracker sample, rad^2, body frame."""
+    return linalg.covariance(params.noise.optical, 3)
+
+
+def initial_mean(first: Mapping[str, Any]) -> State:
+    """The first visible attitude (the identity if there is none) and no bias."""
+    seen = first.get("optical")
+    q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
+    return State(q, jnp.zeros(3, q.dtype))
+
+
+def initial_covariance(params: Parameters) -> Array:
+    """Covariance (6, 6)."""
+    zero = jnp.zeros((3, 3))
+    attitude = linalg.covariance(params.initial.attitude, 3)
+    bias = linalg.covariance(params.initial.bias, 3)
+    return jnp.block([[attitude, zero], [zero, bias]])
+
+
+def rate_noise(u: InputSample, params: Parameters) -> Array:
+    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    matrix = params.calibration.gyroscope_matrix
+    white = linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth
+    return matrix @ white @ matrix.T
+
+
+DEFAULTS = Parameters(
+    Noise(
+        gyroscope=np.deg2rad(0.05),
+        bias_walk=np.deg2rad(0.005),
+        optical=np.deg2rad(0.3),
+    ),
+    Calibration(gyroscope_matrix=np.eye(3), clock_offset=np.array(0.0)),
+    Initial(attitude=np.deg2rad(10.0), bias=np.deg2rad(1.0)),
+)
+
+UNITS = Parameters(
+    Noise("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "rad"),
+    Calibration("1", "s"),
+    Initial("rad", "rad/s"),
+)
+
+MODEL = Model(
+    name="loose",
+    summary="attitude and gyroscope bias, gyroscope as input (recommended)",
+    space=SPACE,
+    transition=transition,
+    process_noise=process_noise,
+    sensors=(Sensor("optical", SO3(), predict_optical, optical_noise, sources.optical_attitude),),
+    parameters=DEFAULTS,
+    units=UNITS,
+    noise_dims=Noise(3, 3, 3),
+    initial_mean=initial_mean,
+    initial_covariance=initial_covariance,
+    start_with=("optical",),
+    input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
+    outputs=(
+        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+        Output(
+            "rate",
+            Euclidean(3, "rad/s"),
+            "body",
+            lambda x, u, params: _rate(x, u.value, params),
+            rate_noise,
+        ),
+    ),
+)

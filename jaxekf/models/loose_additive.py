@@ -1,0 +1,175 @@
+"""`loose_additive`: the filter of Cheng (2023) as published, its misprints mended.
+
+Ten numbers (quaternion, rate, bias), additive errors, the rate in the reference frame acting on the
+left, every stream held to the tracker's instants, eqs. 1 to 17. It is here to reproduce the paper and
+as the Euclidean case of the same core; use `loose` for work: the measured rate is taken as it is, so
+this model holds only while the axis of rotation is constant and the run starts at the identity.
+
+Mended: eq. 14 ends in ``q(k)``; eq. 15's identity is 4 x 4; eq. 17's first term divides by the squared
+rate (here by autodiff); the updated quaternion is normalised, and the sign of each measured one follows
+the predicted one.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, rotation
+from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean
+from jaxekf.model import Model, Output, Parameters, Sensor
+from jaxekf.models import loose, sources
+
+
+class State(NamedTuple):
+    """Quaternion, rate in the reference frame, and bias."""
+
+    q_ref_body: Any
+    rate_ref: Any
+    bias: Any
+
+
+class Noise(NamedTuple):
+    """What is random. The paper's ``Q = T^2 Sigma_w``: a density here is ``sqrt(T Sigma_w)``."""
+
+    quaternion: Any
+    """Process noise of each quaternion component, spectral density; shape (), (4,) or (4, 4)."""
+    acceleration: Any
+    """Process noise of the rate, spectral density; shape (), (3,) or (3, 3)."""
+    bias_walk: Any
+    """Process noise of the bias, spectral density."""
+    optical: Any
+    """Measured quaternion components, standard deviation of a sample; shape (), (4,) or (4, 4)."""
+    gyroscope: Any
+    """Measured rate, standard deviation of a held sample."""
+
+
+class Calibration(NamedTuple):
+    """This model has nothing to calibrate."""
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    quaternion: Any
+    rate: Any
+    bias: Any
+
+
+SPACE: Any = State(AdditiveQuaternion(), Euclidean(3, "rad/s"), Euclidean(3, "rad/s"))
+
+
+def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
+    """Eq. 14: ``q(k+1) = g(rate, T) q(k)``; rate and bias are random walks (eqs. 9, 10)."""
+    turned = rotation.product(rotation.exp(x.rate_ref * dt), x.q_ref_body)
+    return State(turned + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
+
+
+def _block_diagonal(leaves: tuple[Any, Any, Any]) -> Array:
+    blocks = [linalg.covariance(leaf, dim) for leaf, dim in zip(leaves, (4, 3, 3), strict=True)]
+    rows = []
+    for i, row in enumerate(blocks):
+        rows.append(
+            [row if i == j else jnp.zeros((row.shape[0], b.shape[0])) for j, b in enumerate(blocks)]
+        )
+    return jnp.block(rows)
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (10, 10), ``Gamma Sigma_w Gamma'`` with ``Gamma = T I``, written in densities."""
+    noise = params.noise
+    return _block_diagonal((noise.quaternion, noise.acceleration, noise.bias_walk)) * dt
+
+
+def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
+    """Eq. 12: rate plus bias."""
+    return x.rate_ref + x.bias
+
+
+def optical_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (4, 4) of the quaternion's components."""
+    return linalg.covariance(params.noise.optical, 4)
+
+
+def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of a held sample, (rad/s)^2."""
+    return linalg.covariance(params.noise.gyroscope, 3)
+
+
+def project(x: State) -> State:
+    """The updated quaternion back on the unit sphere, which an additive update leaves."""
+    return x._replace(q_ref_body=rotation.normalise(x.q_ref_body))
+
+
+def initial_mean(first: Mapping[str, Any]) -> State:
+    """The first visible attitude, the first measured rate, and no bias."""
+    start = loose.initial_mean(first)
+    rate = first.get("gyroscope")
+    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
+
+
+def initial_covariance(params: Parameters) -> Array:
+    """Covariance (10, 10)."""
+    return _block_diagonal(tuple(params.initial))
+
+
+def rate_body(x: State, u: Any, params: Parameters) -> Array:
+    """The rate turned into the body frame, where the other models and the encoder give it."""
+    return rotation.rotate_inverse(x.q_ref_body, x.rate_ref)
+
+
+DEFAULTS = Parameters(
+    Noise(
+        quaternion=1e-4,
+        acceleration=np.deg2rad(30.0),
+        bias_walk=np.deg2rad(0.005),
+        optical=0.5 * np.deg2rad(0.3),
+        gyroscope=np.deg2rad(0.6),
+    ),
+    Calibration(),
+    Initial(quaternion=0.1, rate=np.deg2rad(10.0), bias=np.deg2rad(1.0)),
+)
+
+UNITS = Parameters(
+    Noise("1/sqrt(s)", "rad/s^2/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "1", "rad/s"),
+    Calibration(),
+    Initial("1", "rad/s", "rad/s"),
+)
+
+MODEL = Model(
+    name="loose_additive",
+    summary="Cheng (2023) as published: ten numbers, held streams, additive quaternion",
+    space=SPACE,
+    transition=transition,
+    process_noise=process_noise,
+    sensors=(
+        Sensor(
+            "optical",
+            AdditiveQuaternion(),
+            loose.predict_optical,
+            optical_noise,
+            sources.optical_attitude,
+        ),
+        Sensor(
+            "gyroscope",
+            Euclidean(3, "rad/s"),
+            predict_gyroscope,
+            gyroscope_noise,
+            sources.gyroscope,
+        ),
+    ),
+    parameters=DEFAULTS,
+    units=UNITS,
+    noise_dims=Noise(4, 3, 3, 4, 3),
+    initial_mean=initial_mean,
+    initial_covariance=initial_covariance,
+    start_with=("optical",),
+    outputs=(
+        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+        Output("rate", Euclidean(3, "rad/s"), "body", rate_body),
+    ),
+    project=project,
+    hold_to="optical",
+)

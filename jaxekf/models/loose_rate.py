@@ -1,0 +1,143 @@
+"""`loose_rate`: attitude, angular rate and gyroscope bias, the gyroscope as a measurement.
+
+Cheng's (2023) state with an error-state attitude and body rates: 9 degrees of freedom. The rate is a
+random walk driven by a density of angular acceleration, so that smooth motion filters the
+gyroscope's own noise, which `loose` does not.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Model, Output, Parameters, Sensor
+from jaxekf.models import loose, sources
+
+
+class State(NamedTuple):
+    """Attitude, body rate and gyroscope bias."""
+
+    q_ref_body: Any
+    rate: Any
+    bias: Any
+
+
+class Noise(NamedTuple):
+    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+
+    acceleration: Any
+    """Angular acceleration, spectral density: how fast the rate may change."""
+    gyroscope: Any
+    """White noise of the measured rate, spectral density."""
+    bias_walk: Any
+    """Random walk of the bias, spectral density of its derivative."""
+    optical: Any
+    """The tracker's attitude, standard deviation of a sample, body frame."""
+
+
+class Calibration(NamedTuple):
+    """This model has nothing to calibrate."""
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    attitude: Any
+    rate: Any
+    bias: Any
+
+
+SPACE: Any = State(SO3(), Euclidean(3, "rad/s"), Euclidean(3, "rad/s"))
+
+
+def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
+    """``q exp(rate dt + w_angle)``, ``rate + w_rate`` and ``bias + w_bias``."""
+    turn = x.rate * dt + w[:3]
+    return State(SO3().retract(x.q_ref_body, turn), x.rate + w[3:6], x.bias + w[6:])
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (9, 9) of angle, rate and bias noise over ``dt``, exact for the double integrator."""
+    push = linalg.covariance(params.noise.acceleration, 3)
+    walk = linalg.covariance(params.noise.bias_walk, 3) * dt
+    cross = 0.5 * push * dt**2
+    zero = jnp.zeros((3, 3))
+    return jnp.block(
+        [[push * dt**3 / 3.0, cross, zero], [cross, push * dt, zero], [zero, zero, walk]]
+    )
+
+
+def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
+    """Rate plus bias."""
+    return x.rate + x.bias
+
+
+def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of a gyroscope sample that averages over its own period ``dt``."""
+    return linalg.covariance(params.noise.gyroscope, 3) / dt
+
+
+def initial_mean(first: Mapping[str, Any]) -> State:
+    """The first visible attitude, the first measured rate, and no bias."""
+    start = loose.initial_mean(first)
+    rate = first.get("gyroscope")
+    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
+
+
+def initial_covariance(params: Parameters) -> Array:
+    """Covariance (9, 9)."""
+    blocks = [linalg.covariance(leaf, 3) for leaf in params.initial]
+    zero = jnp.zeros((3, 3))
+    return jnp.block([[blocks[i] if i == j else zero for j in range(3)] for i in range(3)])
+
+
+DEFAULTS = Parameters(
+    Noise(
+        acceleration=np.deg2rad(30.0),
+        gyroscope=np.deg2rad(0.05),
+        bias_walk=np.deg2rad(0.005),
+        optical=np.deg2rad(0.3),
+    ),
+    Calibration(),
+    Initial(attitude=np.deg2rad(10.0), rate=np.deg2rad(10.0), bias=np.deg2rad(1.0)),
+)
+
+UNITS = Parameters(
+    Noise("rad/s^2/sqrt(Hz)", "rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "rad"),
+    Calibration(),
+    Initial("rad", "rad/s", "rad/s"),
+)
+
+MODEL = Model(
+    name="loose_rate",
+    summary="attitude, rate and gyroscope bias, gyroscope as measurement",
+    space=SPACE,
+    transition=transition,
+    process_noise=process_noise,
+    sensors=(
+        Sensor(
+            "optical", SO3(), loose.predict_optical, loose.optical_noise, sources.optical_attitude
+        ),
+        Sensor(
+            "gyroscope",
+            Euclidean(3, "rad/s"),
+            predict_gyroscope,
+            gyroscope_noise,
+            sources.gyroscope,
+        ),
+    ),
+    parameters=DEFAULTS,
+    units=UNITS,
+    noise_dims=Noise(3, 3, 3, 3),
+    initial_mean=initial_mean,
+    initial_covariance=initial_covariance,
+    start_with=("optical",),
+    outputs=(
+        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+        Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+    ),
+)

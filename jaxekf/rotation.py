@@ -1,0 +1,173 @@
+"""Unit quaternions and rotation vectors, safe under differentiation.
+
+Quaternions are ``w, x, y, z`` with the Hamilton product, of unit norm, and rotate body coordinates
+to reference coordinates: ``v_ref = q * v_body * conj(q)``. ``q`` and ``-q`` are one rotation.
+Rotation vectors are in radians. Every function works on the last axis and broadcasts nothing
+silently; gradients, also second ones, are finite everywhere, the zero rotation included.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+# Below these squared sizes the series are exact to rounding, value and two derivatives, so that the
+# closed forms (which divide by the size) are never evaluated where they are 0/0.
+_SMALL_ANGLE_SQUARED = 1e-2
+_SMALL_TANGENT_SQUARED = 1e-3
+
+
+def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
+    """Horner evaluation of ``sum(c[i] * x**i)``."""
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        value = value * x + coefficient
+    return value
+
+
+def identity() -> Array:
+    """The quaternion of no rotation, shape (4,)."""
+    return jnp.array([1.0, 0.0, 0.0, 0.0])
+
+
+def product(p: Array, q: Array) -> Array:
+    """Hamilton product ``p * q`` of quaternions, shapes (..., 4)."""
+    pw, px, py, pz = (p[..., i] for i in range(4))
+    qw, qx, qy, qz = (q[..., i] for i in range(4))
+    return jnp.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: Array) -> Array:
+    """Inverse of a unit quaternion, shape (..., 4)."""
+    return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+
+
+def normalise(q: Array) -> Array:
+    """``q`` scaled to unit norm, shape (..., 4); ``q`` must not be zero."""
+    return q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
+
+
+def keep_unit(q: Array) -> Array:
+    """``q``, of unit norm but for rounding, scaled back to it: one Newton step, no division."""
+    return q * (1.5 - 0.5 * jnp.sum(q * q, axis=-1, keepdims=True))
+
+
+def pure(vector: Array) -> Array:
+    """The quaternion without real part, shapes (..., 3) to (..., 4)."""
+    return jnp.concatenate([jnp.zeros_like(vector[..., :1]), vector], axis=-1)
+
+
+@jax.custom_jvp
+def _reciprocal(x: Array) -> Array:
+    """``1 / x`` whose derivatives are products: on a CPU each division costs a kernel of its own."""
+    return 1.0 / x
+
+
+@_reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    inverse = _reciprocal(*primals)
+    return inverse, -inverse * inverse * tangents[0]
+
+
+def _half_angle(delta: Array) -> tuple[Array, Array]:
+    """``cos(a / 2)`` and ``sin(a / 2) / a`` for ``a = |delta|``, shape (...)."""
+    squared = jnp.sum(delta * delta, axis=-1)
+    small = squared < _SMALL_ANGLE_SQUARED
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    series = jnp.where(small, squared, 0.0)
+    cosine = _polynomial(series, (1.0, -1 / 8, 1 / 384, -1 / 46080, 1 / 10321920))
+    sine = _polynomial(series, (1 / 2, -1 / 48, 1 / 3840, -1 / 645120, 1 / 185794560))
+    return (
+        jnp.where(small, cosine, jnp.cos(0.5 * angle)),
+        jnp.where(small, sine, jnp.sin(0.5 * angle) * _reciprocal(angle)),
+    )
+
+
+def exp(delta: Array) -> Array:
+    """Quaternion of the rotation vector ``delta`` in radians, shapes (..., 3) to (..., 4)."""
+    cosine, sine = _half_angle(delta)
+    return jnp.concatenate([cosine[..., None], sine[..., None] * delta], axis=-1)
+
+
+def log(q: Array) -> Array:
+    """Rotation vector in radians, of length at most pi, shapes (..., 4) to (..., 3).
+
+    ``q`` and ``-q`` give the same vector: the one with ``w >= 0`` is used.
+    """
+    flip = jnp.where(q[..., :1] < 0.0, -1.0, 1.0)
+    q = q * flip
+    w, vector = q[..., 0], q[..., 1:]
+    squared = jnp.sum(vector * vector, axis=-1)
+    small = squared < _SMALL_TANGENT_SQUARED * w * w
+    w_series = jnp.where(small, w, 1.0)
+    w_inverse = _reciprocal(w_series)
+    tangent = jnp.where(small, squared, 0.0) * w_inverse * w_inverse
+    series = _polynomial(tangent, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9, -1 / 11, 1 / 13, -1 / 15))
+    length = jnp.sqrt(jnp.where(small, 1.0, squared))
+    factor = jnp.where(
+        small, 2.0 * series * w_inverse, 2.0 * jnp.arctan2(length, w) * _reciprocal(length)
+    )
+    return factor[..., None] * vector
+
+
+def rotate(q: Array, vector: Array) -> Array:
+    """``vector`` turned by ``q``: body coordinates to reference coordinates, shapes (..., 4), (..., 3)."""
+    imaginary = q[..., 1:]
+    twice_cross = 2.0 * jnp.cross(imaginary, vector)
+    return vector + q[..., :1] * twice_cross + jnp.cross(imaginary, twice_cross)
+
+
+def rotate_inverse(q: Array, vector: Array) -> Array:
+    """``vector`` turned by the inverse of ``q``: reference coordinates to body coordinates."""
+    return rotate(conjugate(q), vector)
+
+
+def to_matrix(q: Array) -> Array:
+    """Rotation matrix ``R`` with ``v_ref = R @ v_body``, shapes (..., 4) to (..., 3, 3)."""
+    w, x, y, z = (q[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def difference(q: Array, r: Array) -> Array:
+    """Rotation vector from ``q`` to ``r`` in the body frame of ``q``: ``log(conj(q) * r)``."""
+    return log(product(conjugate(q), r))
+
+
+def skew(vector: Array) -> Array:
+    """Matrix of the cross product, ``skew(a) @ b == cross(a, b)``, shapes (3,) to (3, 3)."""
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+
+
+def right_jacobian(delta: Array) -> Array:
+    """``J`` with ``exp(delta + e) ~ exp(delta) * exp(J @ e)``, shapes (3,) to (3, 3)."""
+    squared = jnp.sum(delta * delta)
+    small = squared < _SMALL_ANGLE_SQUARED
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    inverse = _reciprocal(angle)
+    series = jnp.where(small, squared, 0.0)
+    first = jnp.where(
+        small,
+        _polynomial(series, (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800)),
+        (1.0 - jnp.cos(angle)) * inverse * inverse,
+    )
+    second = jnp.where(
+        small,
+        _polynomial(series, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)),
+        (angle - jnp.sin(angle)) * inverse * inverse * inverse,
+    )
+    cross = skew(delta)
+    return jnp.eye(3, dtype=delta.dtype) - first * cross + second * (cross @ cross)

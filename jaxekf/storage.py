@@ -1,0 +1,429 @@
+"""Recorded runs on disk: a folder with `recording.toml` and one CSV file a stream.
+
+``optical.csv``  time,qw,qx,qy,qz[,x,y,z][,status]
+``imu.csv``      time,gx,gy,gz[,ax,ay,az][,mx,my,mz]
+``encoder.csv``  time,angle[,scored]  or  time,qw,qx,qy,qz[,scored]
+
+Times are decimal seconds, read exactly to the nanosecond. `recording.toml` says what the numbers are.
+Folders are written whole or not at all.
+"""
+
+import csv
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaxekf.errors import RecordingError
+from jaxekf.recording import (
+    NANOSECONDS,
+    Encoder,
+    Floats,
+    Imu,
+    Optical,
+    Recording,
+    Times,
+    from_scipy,
+    to_scipy,
+    unit_quaternions,
+)
+
+SCHEMA_VERSION = 1
+_QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+class Table(NamedTuple):
+    """A CSV file as text, its rows with the number of their line."""
+
+    path: Path
+    columns: tuple[str, ...]
+    rows: list[list[str]]
+    lines: list[int]
+
+
+def load(path: Path | str) -> Recording:
+    """Read a recorded run. Raises `RecordingError`, which names file, line and column."""
+    folder = Path(path)
+    about = _read_description(folder)
+    read: dict[str, Any] = {}
+    readers: dict[str, Callable[[Table, Mapping[str, Any]], Any]] = {
+        "optical": _optical,
+        "imu": _imu,
+        "encoder": _encoder,
+    }
+    for label, reader in readers.items():
+        file = folder / f"{label}.csv"
+        if file.exists() or label in about:
+            read[label] = reader(_read_table(file), about.get(label, {}))
+    if not read:
+        raise RecordingError(
+            folder, "no stream", "optical.csv, imu.csv or encoder.csv", "another folder"
+        )
+    info = {key: about[key] for key in about if key not in readers}
+    info |= {f"{key}_about": dict(about[key]) for key in readers if key in about}
+    name = str(about.get("name", folder.resolve().name))
+    return Recording(name, **read, info=info, path=folder)
+
+
+def _read_description(folder: Path) -> Mapping[str, Any]:
+    file = folder / "recording.toml"
+    if not folder.is_dir():
+        raise RecordingError(folder, "no such folder", "a recorded run's folder", "another path")
+    if not file.is_file():
+        raise RecordingError(
+            file, "no such file", "the description of the run", "writing one (see README)"
+        )
+    try:
+        about = tomllib.loads(file.read_text("utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(
+            file, f"text that is not TOML ({error})", "TOML", "mending it"
+        ) from error
+    version = about.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise RecordingError(
+            file,
+            f"schema_version {version!r}",
+            f"{SCHEMA_VERSION}",
+            "a run written for this version",
+            column="schema_version",
+        )
+    return about
+
+
+def _read_table(path: Path) -> Table:
+    if not path.is_file():
+        raise RecordingError(
+            path, "no such file", "the stream named in recording.toml", "adding it"
+        )
+    try:
+        text = path.read_text("utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise RecordingError(
+            path, f"unreadable text ({error})", "UTF-8", "saving as UTF-8"
+        ) from error
+    rows, lines = [], []
+    reader = csv.reader(text.splitlines())
+    for row in reader:
+        if row:
+            rows.append(row)
+            lines.append(reader.line_num)
+    if not rows:
+        raise RecordingError(
+            path, "an empty file", "a header and samples", "exporting the run again"
+        )
+    columns = tuple(cell.strip() for cell in rows[0])
+    if len(rows) == 1:
+        raise RecordingError(path, "0 samples", "at least one", "exporting the run again", line=1)
+    if len(set(columns)) != len(columns):
+        raise RecordingError(path, f"columns {list(columns)}", "each once", "renaming one", line=1)
+    for row, line in zip(rows[1:], lines[1:], strict=True):
+        if len(row) != len(columns):
+            raise RecordingError(
+                path,
+                f"{len(row)} cells",
+                f"{len(columns)} as in the header",
+                "completing the row or removing it",
+                line=line,
+            )
+    return Table(path, columns, rows[1:], lines[1:])
+
+
+def _need_columns(table: Table, allowed: Iterable[Sequence[str]], optional: Sequence[str]) -> None:
+    """The columns are one of the allowed sets plus any of the optional ones."""
+    choices = list(allowed)
+    for choice in choices:
+        extra = set(table.columns) - set(choice)
+        if set(choice) <= set(table.columns) and extra <= set(optional):
+            return
+    wanted = " or ".join(",".join(choice) for choice in choices)
+    more = f" (and any of {','.join(optional)})" if optional else ""
+    raise RecordingError(
+        table.path,
+        f"columns {','.join(table.columns)}",
+        f"{wanted}{more}",
+        "renaming or adding columns",
+        line=1,
+    )
+
+
+def _numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
+    """Columns as float64 (N, len(names)); with `blank`, empty cells are NaN."""
+    values = np.empty((len(table.rows), len(names)))
+    for j, name in enumerate(names):
+        at = table.columns.index(name)
+        for i, row in enumerate(table.rows):
+            cell = row[at].strip()
+            try:
+                values[i, j] = np.nan if blank and not cell else float(cell)
+            except ValueError:
+                raise RecordingError(
+                    table.path,
+                    f"'{cell}'",
+                    "a number",
+                    "correcting the cell",
+                    line=table.lines[i],
+                    column=name,
+                ) from None
+    return values
+
+
+def _finite(table: Table, names: tuple[str, ...]) -> Floats:
+    values = _numbers(table, names)
+    bad = np.argwhere(~np.isfinite(values))
+    if bad.size:
+        i, j = (int(at) for at in bad[0])
+        raise RecordingError(
+            table.path,
+            f"{values[i, j]}",
+            "a finite number",
+            "removing the row",
+            line=table.lines[i],
+            column=names[j],
+        )
+    return values
+
+
+def parse_seconds(text: str) -> int:
+    """Decimal seconds to nanoseconds, exactly; digits beyond the ninth are rounded."""
+    whole, _, part = text.partition(".")
+    if whole.isdigit() and len(part) <= 9 and (part.isdigit() or not part):
+        return int(whole) * NANOSECONDS + int(part.ljust(9, "0") or 0)
+    return int((Decimal(text) * NANOSECONDS).to_integral_value())
+
+
+def _times(table: Table) -> Times:
+    at = table.columns.index("time")
+    times = np.empty(len(table.rows), np.int64)
+    for i, row in enumerate(table.rows):
+        cell = row[at].strip()
+        try:
+            times[i] = parse_seconds(cell)
+        except (InvalidOperation, ValueError, OverflowError):
+            raise RecordingError(
+                table.path,
+                f"'{cell}'",
+                "a time in seconds",
+                "correcting the cell",
+                line=table.lines[i],
+                column="time",
+            ) from None
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if backwards.size:
+        i = int(backwards[0]) + 1
+        raise RecordingError(
+            table.path,
+            f"{table.rows[i][at].strip()} after {table.rows[i - 1][at].strip()}",
+            "times that increase",
+            "sorting the rows and removing duplicates",
+            line=table.lines[i],
+            column="time",
+        )
+    return times
+
+
+def _optical(table: Table, about: Mapping[str, Any]) -> Optical:
+    _need_columns(table, [("time", *_QUATERNION)], ("x", "y", "z", "status", "error"))
+    q, valid = unit_quaternions(_numbers(table, _QUATERNION, blank=True))
+    position = None
+    if {"x", "y", "z"} <= set(table.columns):
+        position = _numbers(table, ("x", "y", "z"), blank=True)
+    if "status" in table.columns:
+        at = table.columns.index("status")
+        good = {str(word).lower() for word in about.get("status_ok", ["ok", "0"])}
+        valid &= np.array([row[at].strip().lower() in good for row in table.rows])
+    return Optical(_times(table), q, valid, position)
+
+
+def _imu(table: Table, about: Mapping[str, Any]) -> Imu:
+    acceleration, field = ("ax", "ay", "az"), ("mx", "my", "mz")
+    _need_columns(table, [("time", "gx", "gy", "gz")], acceleration + field)
+
+    def maybe(names: tuple[str, ...]) -> Floats | None:
+        return _finite(table, names) if set(names) <= set(table.columns) else None
+
+    return Imu(_times(table), _finite(table, ("gx", "gy", "gz")), maybe(acceleration), maybe(field))
+
+
+def _flags(table: Table, name: str) -> NDArray[np.bool_]:
+    if name not in table.columns:
+        return np.ones(len(table.rows), bool)
+    return _finite(table, (name,))[:, 0] != 0.0
+
+
+def _encoder(table: Table, about: Mapping[str, Any]) -> Encoder:
+    """Attitude of the tool from a joint angle or a quaternion, in the tracker's frame.
+
+    With an angle: ``q = q_zero exp(axis angle)`` where the axis is fixed in the body
+    (``acts_on = "body"``), ``exp(axis angle) q_zero`` where it is fixed in the reference.
+    ``q_optical_encoder`` turns the encoder's frame into the tracker's.
+    """
+    _need_columns(table, [("time", "angle"), ("time", *_QUATERNION)], ("scored",))
+    scored = _flags(table, "scored")
+    if "angle" in table.columns:
+        q = joint_attitude(_finite(table, ("angle",))[:, 0], about, table.path)
+        valid = np.ones(len(q), bool)
+    else:
+        q, valid = unit_quaternions(_numbers(table, _QUATERNION, blank=True))
+    frame = to_scipy(np.asarray(about.get("q_optical_encoder", [1.0, 0.0, 0.0, 0.0]), float))
+    return Encoder(_times(table), from_scipy(frame * to_scipy(q)), valid, scored & valid)
+
+
+def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -> Floats:
+    """Quaternions (N, 4) of a joint's angles in radians, see `_encoder`."""
+    if "axis" not in about:
+        raise RecordingError(
+            place, "a joint angle without an axis", "axis = [x, y, z]", "adding it under [encoder]"
+        )
+    axis = np.asarray(about["axis"], float)
+    axis = axis / np.linalg.norm(axis)
+    turn = Rotation.from_rotvec(angle[:, None] * axis)
+    zero = to_scipy(np.asarray(about.get("q_zero", [1.0, 0.0, 0.0, 0.0]), float))
+    side = about.get("acts_on", "reference")
+    if side not in ("reference", "body"):
+        raise RecordingError(
+            place, f"acts_on = '{side}'", "'reference' or 'body'", "correcting recording.toml"
+        )
+    return from_scipy(turn * zero if side == "reference" else zero * turn)
+
+
+# ---------------------------------------------------------------------------------------------
+# Writing
+
+
+@contextmanager
+def whole_folder(path: Path | str, *, overwrite: bool = False) -> Any:
+    """A temporary folder beside `path` that becomes it when the block ends well, and is gone if not."""
+    target = Path(path)
+    if target.exists() and not overwrite:
+        raise RecordingError(
+            target, "a path that exists", "a new one", "another output or the overwrite option"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o755)
+        if target.is_dir():
+            shutil.rmtree(target)
+        elif target.exists():
+            target.unlink()
+        temporary.rename(target)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def write_whole(path: Path | str, text: str) -> None:
+    """Write a text file by a temporary one and a rename, so that it is never half there."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", dir=target.parent, prefix=f".{target.name}-", delete=False
+    ) as file:
+        temporary = Path(file.name)
+        file.write(text)
+    temporary.chmod(0o644)
+    temporary.replace(target)
+
+
+def format_seconds(time_ns: int) -> str:
+    """Nanoseconds as decimal seconds, exactly, without trailing zeros."""
+    sign, size = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
+    whole, part = divmod(int(size), NANOSECONDS)
+    digits = f"{part:09d}".rstrip("0")
+    return f"{sign}{whole}.{digits}" if digits else f"{sign}{whole}"
+
+
+def write_csv(
+    path: Path, columns: Sequence[str], time_ns: Times, values: Floats, digits: int
+) -> None:
+    """A CSV file of a time column and numbers; NaN is written as a blank cell."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["time", *columns])
+        for time, row in zip(time_ns, values, strict=True):
+            cells = ["" if np.isnan(v) else f"{v:.{digits}g}" for v in row]
+            writer.writerow([format_seconds(int(time)), *cells])
+
+
+def save(
+    recording: Recording, path: Path | str, *, overwrite: bool = False, digits: int = 17
+) -> Path:
+    """Write a run as a folder; hidden tracker samples become blank cells. Returns the folder."""
+    about: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "name": recording.name}
+    about |= {
+        k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about
+    }
+    with whole_folder(path, overwrite=overwrite) as folder:
+        for label in ("optical", "imu", "encoder"):
+            stream = getattr(recording, label)
+            if stream is None:
+                continue
+            section = dict(recording.info.get(f"{label}_about", {}))
+            columns, values, written = _STREAM_COLUMNS[label](stream, section)
+            about[label] = written
+            write_csv(folder / f"{label}.csv", columns, stream.time_ns, values, digits)
+        (folder / "recording.toml").write_text(tomli_w.dumps(about), "utf-8")
+    return Path(path)
+
+
+def _optical_columns(stream: Optical, about: dict[str, Any]) -> Any:
+    hidden = ~stream.valid[:, None]
+    columns, values = list(_QUATERNION), [np.where(hidden, np.nan, stream.q_ref_body)]
+    if stream.position is not None:
+        columns += ["x", "y", "z"]
+        values.append(np.where(hidden, np.nan, stream.position))
+    about.pop("status_ok", None)
+    about |= {"kind": "pose", "quaternion": "w,x,y,z, body to reference", "unit": "1, m"}
+    return columns, np.concatenate(values, axis=1), about
+
+
+def _imu_columns(stream: Imu, about: dict[str, Any]) -> Any:
+    columns, values = ["gx", "gy", "gz"], [stream.gyroscope]
+    if stream.accelerometer is not None:
+        columns += ["ax", "ay", "az"]
+        values.append(stream.accelerometer)
+    if stream.magnetometer is not None:
+        columns += ["mx", "my", "mz"]
+        values.append(stream.magnetometer)
+    about |= {"kind": "imu", "frame": "body", "unit": "rad/s, m/s^2"}
+    return columns, np.concatenate(values, axis=1), about
+
+
+def _encoder_columns(stream: Encoder, about: dict[str, Any]) -> Any:
+    """A joint angle again where the description is of a joint, else quaternions."""
+    if "axis" in about:
+        frame = to_scipy(np.asarray(about.get("q_optical_encoder", [1.0, 0.0, 0.0, 0.0]), float))
+        zero = to_scipy(np.asarray(about.get("q_zero", [1.0, 0.0, 0.0, 0.0]), float))
+        q = frame.inv() * to_scipy(stream.q_ref_body)
+        on_reference = about.get("acts_on", "reference") == "reference"
+        turn = q * zero.inv() if on_reference else zero.inv() * q
+        axis = np.asarray(about["axis"], float)
+        vector = turn.as_rotvec() @ (axis / np.linalg.norm(axis))
+        columns, values = ["angle"], np.unwrap(vector)[:, None]
+        about |= {"kind": "joint", "unit": "rad"}
+    else:
+        columns = list(_QUATERNION)
+        values = np.where(~stream.valid[:, None], np.nan, stream.q_ref_body)
+        about |= {"kind": "attitude", "quaternion": "w,x,y,z, body to reference", "unit": "1"}
+        about.pop("q_optical_encoder", None)
+    if not stream.scored.all():
+        columns, values = [*columns, "scored"], np.c_[values, stream.scored.astype(float)]
+    return columns, values, about
+
+
+_STREAM_COLUMNS: dict[str, Callable[[Any, dict[str, Any]], Any]] = {
+    "optical": _optical_columns,
+    "imu": _imu_columns,
+    "encoder": _encoder_columns,
+}

@@ -1,0 +1,391 @@
+"""Asynchronous streams merged to one sequence of steps, with exact times.
+
+The steps come in *epochs* of a fixed number of substeps. A fast sensor may be sampled at every
+substep; a slow one (a tracker beside a gyroscope) only at the last of its epoch, so that its update
+is not paid for at every fast step. Epochs that are not full are padded **in front** by substeps of
+``dt = 0``, which change nothing. A sample that is missing is a mask, never a held value.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxekf.errors import ModelError, RecordingError
+from jaxekf.model import Model, Sensor
+from jaxekf.recording import NANOSECONDS, Recording, Samples, Times, period_ns
+
+_UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
+_LONGEST_EPOCH = 32
+
+
+class Rows(NamedTuple):
+    """Samples of one sensor, one for each (sub)step; leading axes are the steps'."""
+
+    value: Any
+    aux: Any
+    mask: Any
+    """(..., rows) True where a row is visible."""
+    dt: Any
+    """Seconds since the sensor's previous sample."""
+
+
+class Knots(NamedTuple):
+    """A sampled input as a piecewise linear function of time since the start of the run."""
+
+    time: Any
+    """(N,) seconds."""
+    value: Any
+    """(N, c)."""
+    integral: Any
+    """(N, c) trapezoidal integral from the first knot."""
+
+
+class Steps(NamedTuple):
+    """What the filter scans over: K epochs of S substeps."""
+
+    time: Any
+    """(K, S) seconds since the start of the run, at the end of each substep."""
+    dt: Any
+    """(K, S) seconds; 0 in padding."""
+    valid: Any
+    """(K, S) False in padding."""
+    knots: Knots | None
+    fast: dict[str, Rows]
+    """Sensors sampled at substeps, leading axes (K, S)."""
+    slow: dict[str, Rows]
+    """Sensors sampled at the end of epochs, leading axis (K,)."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The steps of one run, and what the host must remember about them."""
+
+    name: str
+    steps: Steps
+    time_ns: Times
+    """(K, S) int64 nanoseconds at the end of each substep."""
+    first: dict[str, Any]
+    """First visible sample of each sensor."""
+    account: dict[str, dict[str, int]] = field(default_factory=dict)
+    """For each stream: rows read, fed to the filter, masked, and dropped by reason."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(K, S) substeps that are not padding."""
+        return np.asarray(self.steps.valid)
+
+
+def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = None) -> Timeline:
+    """The timeline of one recording for one model.
+
+    `slow` names the sensors that are sampled at the end of epochs only; None finds them.
+
+    Raises `RecordingError` where streams are missing or do not overlap, or where a sensor that the
+    model must start with is never seen.
+    """
+    samples = {s.name: _read(s, recording) for s in model.sensors}
+    driver = model.input.source(recording) if model.input else None
+    start, end = _span(model, recording, samples, driver)
+    account = {name: _count(stream, start, end) for name, stream in samples.items()}
+    samples = {name: _cut(stream, start, end) for name, stream in samples.items()}
+    if model.hold_to is not None:
+        samples = _hold(samples, model.hold_to, account)
+    events = [stream.time_ns for stream in samples.values()]
+    if driver is not None:
+        inside = (driver.time_ns >= start) & (driver.time_ns <= end)
+        events.append(driver.time_ns[inside])
+    times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
+    if slow is None:
+        slow = _slow_sensors(samples, times)
+    index = _epochs(times, [samples[name].time_ns for name in slow])
+    steps, step_times = _lay_out(times, index, samples, slow, start)
+    if driver is not None:
+        steps = steps._replace(knots=_knots(driver, start))
+    first = {name: _first_visible(stream) for name, stream in samples.items()}
+    return Timeline(recording.name, steps, step_times, first, account)
+
+
+def build_many(model: Model, recordings: Sequence[Recording]) -> list[Timeline]:
+    """Timelines of several recordings, laid out alike so that they can be stacked."""
+    timelines: list[Timeline] = []
+    for recording in recordings:
+        slow = tuple(timelines[0].steps.slow) if timelines else None
+        timelines.append(build(model, recording, slow))
+    return timelines
+
+
+def from_steps(name: str, steps: Steps, first: dict[str, Any], start_ns: int = 0) -> Timeline:
+    """A timeline from arrays that never were a recording, such as simulated ones."""
+    time_ns = start_ns + np.round(np.asarray(steps.time) * NANOSECONDS).astype(np.int64)
+    return Timeline(name, steps, time_ns, first)
+
+
+def _read(sensor: Sensor, recording: Recording) -> Samples:
+    if sensor.source is None:
+        raise ModelError(
+            f"sensor '{sensor.name}' got a recording, expected arrays because it names no source;"
+            " give it a source"
+        )
+    samples = sensor.source(recording)
+    mask = np.asarray(samples.mask)
+    if mask.ndim == 1:
+        mask = np.repeat(mask[:, None], sensor.rows, axis=1)
+    return Samples(samples.time_ns, samples.value, mask, samples.aux)
+
+
+def _visible(samples: Samples) -> NDArray[np.bool_]:
+    return np.asarray(samples.mask.any(axis=1))
+
+
+def _first_visible(samples: Samples) -> Any:
+    seen = np.flatnonzero(_visible(samples))
+    if seen.size == 0:
+        return None
+    return jax.tree.map(lambda a: np.asarray(a)[seen[0]], samples.value)
+
+
+def _describe(times: Times) -> str:
+    return f"{times[0] / NANOSECONDS:.6f} to {times[-1] / NANOSECONDS:.6f} s"
+
+
+def _span(
+    model: Model, recording: Recording, samples: dict[str, Samples], driver: Samples | None
+) -> tuple[int, int]:
+    """First and last time of the run: from the first usable samples to where the input ends."""
+    place = recording.path or recording.name
+    start = min(int(s.time_ns[0]) for s in samples.values())
+    end = max(int(s.time_ns[-1]) for s in samples.values())
+    if driver is not None:
+        for name, stream in samples.items():
+            if stream.time_ns[0] > driver.time_ns[-1] or stream.time_ns[-1] < driver.time_ns[0]:
+                raise RecordingError(
+                    place,
+                    f"{name} over {_describe(stream.time_ns)} and the input"
+                    f" over {_describe(driver.time_ns)}",
+                    "streams that overlap in time",
+                    "checking the clocks and units of both",
+                )
+        start, end = int(driver.time_ns[0]), int(driver.time_ns[-1])
+    elif model.hold_to is None and len(samples) > 1:
+        _check_overlap(place, samples)
+    for name in model.start_with:
+        stream = samples[name]
+        seen = stream.time_ns[_visible(stream) & (stream.time_ns >= start)]
+        if seen.size == 0 or seen[0] > end:
+            raise RecordingError(
+                place,
+                f"no visible sample of {name} within the run",
+                "at least one to start from",
+                "a run in which the tool is seen",
+            )
+        start = max(start, int(seen[0]))
+    return start, end
+
+
+def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
+    names = list(samples)
+    for other in names[1:]:
+        a, b = samples[names[0]].time_ns, samples[other].time_ns
+        if a[0] > b[-1] or a[-1] < b[0]:
+            raise RecordingError(
+                place,
+                f"{names[0]} over {_describe(a)} and {other} over {_describe(b)}",
+                "streams that overlap in time",
+                "checking the clocks and units of both",
+            )
+
+
+def _count(samples: Samples, start: int, end: int) -> dict[str, int]:
+    inside = (samples.time_ns >= start) & (samples.time_ns <= end)
+    visible = _visible(samples)
+    return {
+        "read": len(samples.time_ns),
+        "fed": int((inside & visible).sum()),
+        "masked": int((inside & ~visible).sum()),
+        "dropped_outside_run": int((~inside).sum()),
+    }
+
+
+def _take(samples: Samples, chosen: NDArray[Any]) -> Samples:
+    def pick(tree: Any) -> Any:
+        return jax.tree.map(lambda a: np.asarray(a)[chosen], tree)
+
+    return Samples(
+        samples.time_ns[chosen], pick(samples.value), samples.mask[chosen], pick(samples.aux)
+    )
+
+
+def _cut(samples: Samples, start: int, end: int) -> Samples:
+    return _take(samples, (samples.time_ns >= start) & (samples.time_ns <= end))
+
+
+def _hold(
+    samples: dict[str, Samples], leader: str, account: dict[str, dict[str, int]]
+) -> dict[str, Samples]:
+    """Every stream held (zero order) on the leader's sampling instants; gaps of the leader are
+    filled at its nominal period, with its own rows masked there."""
+    led = samples[leader]
+    grid = fill_gaps(led.time_ns)
+    position = np.searchsorted(led.time_ns, grid, side="right") - 1
+    present = led.time_ns[position] == grid
+    held = {leader: _take(led, position)}
+    held[leader] = Samples(
+        grid, held[leader].value, held[leader].mask & present[:, None], held[leader].aux
+    )
+    for name, stream in samples.items():
+        if name == leader:
+            continue
+        last = np.searchsorted(stream.time_ns, grid, side="right") - 1
+        taken = _take(stream, np.maximum(last, 0))
+        held[name] = Samples(grid, taken.value, taken.mask & (last >= 0)[:, None], taken.aux)
+        used = int(_visible(held[name]).sum())
+        account[name]["dropped_by_holding"] = account[name]["fed"] - used
+        account[name]["fed"] = used
+    return held
+
+
+def fill_gaps(time_ns: Times) -> Times:
+    """Times with every gap longer than 1.5 nominal periods filled at the nominal period."""
+    period = period_ns(time_ns)
+    if period == 0:
+        return time_ns
+    pieces = [time_ns]
+    steps = np.diff(time_ns)
+    for i in np.flatnonzero(steps > 1.5 * period):
+        count = round(steps[i] / period)
+        pieces.append(time_ns[i] + period * np.arange(1, count, dtype=np.int64))
+    return np.unique(np.concatenate(pieces))
+
+
+def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:
+    """Sensors sampled at no more than half of the instants."""
+    return tuple(name for name, s in samples.items() if 2 * len(s.time_ns) <= len(times) + 1)
+
+
+def _epochs(times: Times, slow_times: list[Times]) -> NDArray[np.intp]:
+    """Index of the instant of each substep, (K, S), -1 in padding; slow samples fall on the last."""
+    if not slow_times:
+        return np.arange(len(times))[:, None]
+    ends = np.flatnonzero(np.isin(times, np.concatenate(slow_times)))
+    if ends.size == 0 or ends[-1] != len(times) - 1:
+        ends = np.append(ends, len(times) - 1)
+    lengths = np.diff(ends, prepend=-1)
+    sizes = np.arange(1, min(_LONGEST_EPOCH, int(lengths.max())) + 1)
+    epochs = np.array([np.ceil(lengths / size).sum() for size in sizes])
+    size = int(sizes[np.argmin(epochs * (sizes + _UPDATE_COST))])
+    chunks = np.ceil(lengths / size).astype(int)
+    index = np.full((int(chunks.sum()), size), -1)
+    last_row = np.cumsum(chunks) - 1
+    for end, length, row in zip(ends, lengths, last_row, strict=True):
+        instants = np.arange(end - length + 1, end + 1)
+        offset = (row + 1) * size - length
+        index.reshape(-1)[offset : offset + length] = instants
+    return index
+
+
+def _lay_out(
+    times: Times,
+    index: NDArray[np.intp],
+    samples: dict[str, Samples],
+    slow: tuple[str, ...],
+    start: int,
+) -> tuple[Steps, Times]:
+    valid = index >= 0
+    # A padded substep carries the instant of the valid one before it (the start, if there is none).
+    flat = np.maximum.accumulate(index.reshape(-1)).reshape(index.shape)
+    step_times = np.where(flat >= 0, times[np.maximum(flat, 0)], start)
+    dt_ns = np.diff(step_times.reshape(-1), prepend=start).reshape(index.shape)
+    fast = {
+        n: _rows(s, np.where(valid, step_times, -1)) for n, s in samples.items() if n not in slow
+    }
+    ends = {n: _rows(samples[n], np.where(valid, step_times, -1)[:, -1]) for n in slow}
+    steps = Steps((step_times - start) / NANOSECONDS, dt_ns / NANOSECONDS, valid, None, fast, ends)
+    return steps, step_times
+
+
+def _rows(samples: Samples, asked: Times) -> Rows:
+    """The samples at the asked times; masked where there is none."""
+    at = np.clip(np.searchsorted(samples.time_ns, asked), 0, len(samples.time_ns) - 1)
+    here = samples.time_ns[at] == asked
+    nominal = period_ns(samples.time_ns)
+    since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal) / NANOSECONDS
+    taken = _take(samples, at)
+    return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
+
+
+def _knots(driver: Samples, start: int) -> Knots:
+    time = (driver.time_ns - start) / NANOSECONDS
+    value = np.asarray(driver.value, float)
+    steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]
+    integral = np.concatenate([np.zeros_like(value[:1]), np.cumsum(steps, axis=0)])
+    return Knots(time, value, integral)
+
+
+def stack(timelines: list[Timeline]) -> Steps:
+    """The steps of several runs on a new leading axis, the shorter ones padded by inert steps."""
+    if not timelines:
+        raise ModelError("got no run to stack, expected at least one; name some recordings")
+    all_steps = [timeline.steps for timeline in timelines]
+    epochs = max(steps.dt.shape[0] for steps in all_steps)
+    substeps = max(steps.dt.shape[1] for steps in all_steps)
+    padded = [pad(steps, epochs, substeps) for steps in all_steps]
+    knots = [len(steps.knots.time) for steps in padded if steps.knots is not None]
+    if knots:
+        padded = [s._replace(knots=_pad_knots(s.knots, max(knots))) for s in padded]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+
+
+def bucket(count: int) -> int:
+    """The next of a few sizes, at most a quarter above `count`: 1, 1.25, 1.5 or 1.75 powers of two."""
+    if count <= 4:
+        return count
+    power = 1 << (count.bit_length() - 1)
+    return next(size for size in range(power, 2 * power + 1, power // 4) if size >= count)
+
+
+def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> Steps:
+    """Steps with inert epochs added at the end, inert substeps in front of each epoch, and the input's
+    knots, where a number is given, made up to it."""
+    more_epochs = epochs - steps.dt.shape[0]
+    more_substeps = substeps - steps.dt.shape[1]
+
+    def widen(array: Any, fill: Any, axes: int) -> Any:
+        array = np.asarray(array)
+        widths = [(0, more_epochs), (more_substeps, 0)][:axes] + [(0, 0)] * (array.ndim - axes)
+        if fill is None:
+            return np.pad(array, widths, mode="edge")
+        return np.pad(array, widths, constant_values=fill)
+
+    def rows(sensor: Rows, axes: int) -> Rows:
+        return Rows(
+            jax.tree.map(lambda a: widen(a, None, axes), sensor.value),
+            jax.tree.map(lambda a: widen(a, None, axes), sensor.aux),
+            widen(sensor.mask, False, axes),
+            widen(sensor.dt, None, axes),
+        )
+
+    return Steps(
+        widen(steps.time, None, 2),
+        widen(steps.dt, 0.0, 2),
+        widen(steps.valid, False, 2),
+        steps.knots if knots is None else _pad_knots(steps.knots, knots),
+        {name: rows(sensor, 2) for name, sensor in steps.fast.items()},
+        {name: rows(sensor, 1) for name, sensor in steps.slow.items()},
+    )
+
+
+def _pad_knots(knots: Knots | None, count: int) -> Knots | None:
+    """Knots up to `count`, held at the last value for a second each: never reached by a real step."""
+    if knots is None or len(knots.time) == count:
+        return knots
+    more = np.arange(1.0, count - len(knots.time) + 1.0)
+    value = np.repeat(knots.value[-1:], len(more), axis=0)
+    return Knots(
+        np.concatenate([knots.time, knots.time[-1] + more]),
+        np.concatenate([knots.value, value]),
+        np.concatenate([knots.integral, knots.integral[-1] + more[:, None] * value]),
+    )

@@ -1,0 +1,36 @@
+"""Whether errors are as large as their covariances say, and the scale that makes them so."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxekf.estimate import evaluate_outputs
+from jaxekf.model import Model, Parameters
+from tuning.data import Data
+from tuning.objectives import output_error, run_batch
+
+
+@partial(jax.jit, static_argnums=0)
+def _mean_nees(model: Model, params: Parameters, data: Data) -> Array:
+    """Mean normalised squared attitude error by degree of freedom, over all judged instants."""
+    output = run_batch(model, params, data)
+    runs = data.steps.dt.shape[0]
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    error = output_error(model, params, output, data, "attitude")
+    _, cov = evaluate_outputs(model, every, output)["attitude"]
+    judged = data.truth["attitude"].judged
+    eye = jnp.eye(cov.shape[-1])
+    safe = jnp.where(judged[..., None, None], cov, jnp.broadcast_to(eye, cov.shape))
+    solved = jnp.linalg.solve(safe, error[..., None])[..., 0]
+    squared = jnp.where(judged, jnp.sum(error * solved, axis=-1), 0.0)
+    return jnp.sum(squared) / (error.shape[-1] * jnp.sum(judged))
+
+
+def scale(model: Model, params: Parameters, data: Data) -> float:
+    """The factor for Q, R and P0 at which the attitude errors match their covariances on average.
+
+    Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set).
+    """
+    return float(_mean_nees(model, params, data))

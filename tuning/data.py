@@ -1,0 +1,94 @@
+"""Runs with truth as arrays that stay on the device while the tuner works."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxekf import storage, timeline
+from jaxekf.errors import TuningError
+from jaxekf.estimate import Run, bucketed
+from jaxekf.model import Model
+from jaxekf.recording import Recording, encoder_at, encoder_rate_at
+from jaxekf.timeline import Steps, Timeline
+
+
+class Truth(NamedTuple):
+    """What an output should have been, and where that is known and judged."""
+
+    value: Any
+    """(runs, K, S, ...) in the output's space."""
+    judged: Any
+    """(runs, K, S)."""
+
+
+class Data(NamedTuple):
+    """Several runs, padded to one length, on the first axis."""
+
+    means: Any
+    """Initial mean of each run."""
+    steps: Steps
+    truth: dict[str, Truth]
+    counted: Any
+    """(runs, K, S) instants past the burn-in, at which the likelihood counts."""
+
+
+def prepare(
+    model: Model, runs: Sequence[Run], *, burn_in_s: float = 0.0, need_truth: bool = True
+) -> Data:
+    """Timelines, initial means and truth of runs, stacked.
+
+    Raises `TuningError` without any run or where truth is needed and none is scored.
+    """
+    if not runs:
+        raise TuningError("got no run to tune on, expected at least one; name some recordings")
+    recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+    lines = timeline.build_many(model, recordings)
+    steps = bucketed(lines)
+    means = [model.initial_mean(line.first) for line in lines]
+    shape = steps.dt.shape
+    names = [out.name for out in model.outputs if out.name in ("attitude", "rate")]
+    truth = {name: Truth(_blank(name, shape), np.zeros(shape, bool)) for name in names}
+    counted = np.zeros(shape, bool)
+    for i, (recording, line) in enumerate(zip(recordings, lines, strict=True)):
+        place = np.s_[i, : line.time_ns.shape[0], shape[2] - line.time_ns.shape[1] :]
+        settled = (np.asarray(line.steps.time) >= burn_in_s) & line.valid
+        counted[place] = settled
+        if recording.encoder is None:
+            continue
+        for name, (value, known) in _truth(recording, line).items():
+            if name in truth:
+                truth[name].value[place] = value
+                truth[name].judged[place] = known & settled
+    if need_truth and not any(t.judged.any() for t in truth.values()):
+        raise TuningError(
+            f"got no scored encoder sample in {[r.name for r in recordings]}, expected some to"
+            " compare with; add encoder.csv or tune by likelihood"
+        )
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
+    return jax.tree.map(jnp.asarray, Data(stacked, steps, truth, counted))
+
+
+def _blank(name: str, shape: tuple[int, ...]) -> Any:
+    """Truth before it is filled in: no turn, no rate."""
+    if name == "rate":
+        return np.zeros((*shape, 3))
+    blank = np.zeros((*shape, 4))
+    blank[..., 0] = 1.0
+    return blank
+
+
+def _truth(recording: Recording, line: Timeline) -> dict[str, tuple[Any, Any]]:
+    """Attitude and body rate of the encoder at every instant of a timeline, and where known."""
+    flat = line.time_ns.reshape(-1)
+    encoder = recording.need_encoder()
+    at = encoder_at(encoder, flat)
+    rate = encoder_rate_at(encoder, flat)
+    known = np.isfinite(rate).all(axis=1) & at.scored
+    shape = line.time_ns.shape
+    return {
+        "attitude": (at.q_ref_body.reshape(*shape, 4), at.scored.reshape(shape)),
+        "rate": (np.where(known[:, None], rate, 0.0).reshape(*shape, 3), known.reshape(shape)),
+    }

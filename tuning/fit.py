@@ -1,0 +1,281 @@
+"""The tuner: gradient steps over all training runs at once, judged on runs it does not learn from."""
+
+import datetime
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from jaxekf import parameters
+from jaxekf.errors import TuningError
+from jaxekf.estimate import Run, provenance, require_float64
+from jaxekf.model import Model, Parameters
+from jaxekf.models import get_model
+from jaxekf.recording import Recording
+from tuning import consistency
+from tuning.data import Data, prepare
+from tuning.noise import Layout, layout, scaled, with_axes
+from tuning.objectives import Objective, attitude_error, evaluate
+
+_MOST_REJECTIONS = 10
+_IMPROVEMENT = 1e-4
+_SMALL_GAIN = 1e-5
+_LONGEST_STEP = 1.0
+
+
+class Iteration(NamedTuple):
+    """One step of the tuner."""
+
+    number: int
+    training: float
+    validation: float
+    """NaN without validation runs."""
+    rejected: bool
+    """The objective or its gradient was not finite; the step was shortened."""
+
+
+Progress = Callable[[Iteration, int], None]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What came out of a tuning."""
+
+    model: Model
+    params: Parameters
+    """The best parameters, by validation where there is one."""
+    start: Parameters
+    objective: Objective
+    best: Iteration
+    history: tuple[Iteration, ...]
+    stopped: str
+    """Why the tuner stopped, in words."""
+    scale: float
+    """Factor by which all covariances were scaled after the fit so that errors match them."""
+    layout: Layout
+    origin: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def rejections(self) -> int:
+        """Steps that were rejected because they were not finite."""
+        return sum(step.rejected for step in self.history)
+
+    def save(self, folder: Path | str) -> None:
+        """Write `noise.toml` and `calibration.toml`, with units and where they came from."""
+        parameters.save(folder, self.model, self.params, self.origin)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _value_and_gradient(
+    model: Model, objective: Objective, where: Layout, free: Array, base: Parameters, data: Data
+) -> tuple[Array, Array]:
+    def value(free: Array) -> Array:
+        return evaluate(model, objective, where.from_free(free, base), data)
+
+    return jax.value_and_grad(value)(free)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _value(
+    model: Model, objective: Objective, where: Layout, free: Array, base: Parameters, data: Data
+) -> Array:
+    return evaluate(model, objective, where.from_free(free, base), data)
+
+
+def tune(
+    runs: Sequence[Run],
+    *,
+    validate: Sequence[Run] = (),
+    model: str | Model = "loose",
+    objective: Objective | None = None,
+    free: Sequence[str] | None = None,
+    start: Parameters | None = None,
+    axes: str = "tied",
+    iterations: int = 60,
+    patience: int = 15,
+    burn_in_s: float = 0.0,
+    rescale: bool | None = None,
+    optimiser: optax.GradientTransformation | None = None,
+    progress: Progress | None = None,
+) -> Tuned:
+    """Tune noise, and calibration where asked, by gradient over all runs in one compiled call.
+
+    `objective` is the attitude error unless given. `free` names what may change (default: all noise);
+    `axes` gives one deviation for all axes (`tied`), one for each, or a `full` matrix. L-BFGS is
+    the optimiser unless an optax one is given. The best parameters so far are kept, by the validation
+    runs where there are any; the tuner stops when they have not improved for `patience` iterations.
+    Steps that are not finite are rejected, shortened and counted.
+
+    The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when the
+    likelihood is not in the objective) they are scaled afterwards so that the training errors match
+    their covariances.
+
+    Raises `TuningError` where the problem is ill-posed, and what `estimate` raises for bad data.
+    """
+    require_float64()
+    chosen = get_model(model)
+    aim = objective or attitude_error()
+    base = with_axes(chosen, chosen.parameters if start is None else start, axes)
+    where = layout(chosen, base, free)
+    need_truth = bool(aim.errors)
+    training = prepare(chosen, runs, burn_in_s=burn_in_s, need_truth=need_truth)
+    held_out = None
+    if validate:
+        held_out = prepare(chosen, validate, burn_in_s=burn_in_s, need_truth=need_truth)
+    search = _Search(chosen, aim, where, base, training, held_out)
+    best_free, best, history, stopped = search.run(optimiser, iterations, patience, progress)
+    params = where.from_free(best_free, base)
+    scale = 1.0
+    if rescale if rescale is not None else not aim.likelihood:
+        scale = consistency.scale(chosen, params, training)
+        params = scaled(params, scale)
+    origin = {
+        "runs": [_name(run) for run in runs],
+        "validation_runs": [_name(run) for run in validate],
+        "objective": aim.describe(),
+        "free": [leaf.name for leaf in where.leaves],
+        "iterations": len(history),
+        "best_iteration": best.number,
+        "training_value": best.training,
+        "covariance_scale": scale,
+        "date": datetime.date.today().isoformat(),
+        **provenance(),
+    }
+    if validate:
+        origin["validation_value"] = best.validation
+    return Tuned(chosen, params, base, aim, best, tuple(history), stopped, scale, where, origin)
+
+
+def _name(run: Run) -> str:
+    return run.name if isinstance(run, Recording) else Path(run).name
+
+
+@dataclass
+class _Search:
+    """The optimiser's loop and what it works on."""
+
+    model: Model
+    objective: Objective
+    layout: Layout
+    base: Parameters
+    training: Data
+    validation: Data | None
+
+    def value_and_gradient(self, free: Array) -> tuple[float, Array]:
+        value, gradient = _value_and_gradient(
+            self.model, self.objective, self.layout, free, self.base, self.training
+        )
+        return float(value), gradient
+
+    def validation_value(self, free: Array) -> float:
+        if self.validation is None:
+            return float("nan")
+        return float(
+            _value(self.model, self.objective, self.layout, free, self.base, self.validation)
+        )
+
+    def run(
+        self,
+        optimiser: optax.GradientTransformation | None,
+        iterations: int,
+        patience: int,
+        progress: Progress | None,
+    ) -> tuple[Array, Iteration, list[Iteration], str]:
+        """Step until done; the best free vector, its iteration, the history and why it stopped."""
+        walk = _Walk(self.layout.to_free(self.base), optimiser)
+        best_free, best_judged, since = walk.candidate, float("inf"), 0
+        best: Iteration | None = None
+        history: list[Iteration] = []
+        for number in range(iterations):
+            value, gradient = self.value_and_gradient(walk.candidate)
+            finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
+            held = self.validation_value(walk.candidate) if finite else float("nan")
+            step = Iteration(number, value, held, not finite)
+            history.append(step)
+            if progress is not None:
+                progress(step, iterations)
+            if best is None and not finite:
+                raise TuningError(
+                    f"got an objective of {value} or a gradient that is not finite at the start,"
+                    " expected finite ones; start from other noise or check the data"
+                )
+            judged = value if self.validation is None else held
+            if finite and judged < best_judged:
+                if best is None or judged < best_judged - _IMPROVEMENT * abs(best_judged):
+                    since = number
+                best_free, best, best_judged = walk.candidate, step, judged
+            if number - since >= patience:
+                return (
+                    best_free,
+                    step if best is None else best,
+                    history,
+                    (f"no improvement in {patience} iterations"),
+                )
+            done = walk.move(value, gradient, finite)
+            if done:
+                return best_free, step if best is None else best, history, done
+        if best is None:
+            raise TuningError(f"got {iterations} iterations, expected at least one; ask for more")
+        return best_free, best, history, f"the {iterations} iterations asked for are done"
+
+
+class _Walk:
+    """Where the optimiser stands and where it looks next.
+
+    The default is L-BFGS with backtracking: the direction is optax's, a step is halved until the
+    objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). An
+    optax optimiser of the caller's own is followed as it is, but for steps that are not finite.
+    """
+
+    def __init__(self, free: Array, optimiser: optax.GradientTransformation | None) -> None:
+        self.monotone = optimiser is None
+        self.optimiser = optimiser or optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
+        self.state = self.optimiser.init(free)
+        self.candidate = self.stand = free
+        self.value = float("inf")
+        self.gradient = self.change = jnp.zeros_like(free)
+        self.rejections = self.small_gains = 0
+
+    def move(self, value: float, gradient: Array, finite: bool) -> str:
+        """Take or refuse the candidate and choose the next; a reason to stop, or nothing."""
+        if not finite or (self.monotone and not self._falls(value)):
+            self.rejections += 1
+            if self.rejections >= _MOST_REJECTIONS:
+                return (
+                    "no step along the gradient lowers the objective any more"
+                    if finite
+                    else f"{_MOST_REJECTIONS} steps in a row failed"
+                )
+            self.change = (0.5 if finite else 0.25) * self.change
+            self.candidate = self.stand + self.change
+            return ""
+        small = self.value - value < _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
+        self.small_gains = self.small_gains + 1 if small and self.monotone else 0
+        if self.small_gains >= 2:
+            return "converged"
+        self.rejections = 0
+        self.stand, self.value, self.gradient = self.candidate, value, gradient
+        update, self.state = self.optimiser.update(gradient, self.state, self.stand)
+        self.change = jnp.asarray(update)
+        if self.monotone:
+            if float(self.change @ gradient) >= 0.0:
+                self.change = -gradient
+            longest = float(jnp.max(jnp.abs(self.change)))
+            if longest == 0.0:
+                return "converged"
+            self.change = self.change * min(1.0, _LONGEST_STEP / longest)
+        self.candidate = self.stand + self.change
+        return ""
+
+    def _falls(self, value: float) -> bool:
+        """Armijo's condition of sufficient decrease."""
+        if not np.isfinite(self.value):
+            return True
+        return value <= self.value + 1e-4 * float(self.change @ self.gradient)

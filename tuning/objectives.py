@@ -1,0 +1,149 @@
+"""What the tuner minimises, as one differentiable number over all runs at once."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import ekf, manifold
+from jaxekf.errors import TuningError
+from jaxekf.model import Belief, Model, Parameters
+from tuning.data import Data
+
+_DEGREES_SQUARED = float(np.rad2deg(1.0) ** 2)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A weighted sum of mean squared errors against truth and of innovation likelihood.
+
+    ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``; attitude
+    errors are geodesic angles in degrees, rate errors in deg/s. Add two objectives to combine them.
+    """
+
+    errors: tuple[tuple[str, float], ...] = ()
+    likelihood: float = 0.0
+
+    def __add__(self, other: "Objective") -> "Objective":
+        return Objective(self.errors + other.errors, self.likelihood + other.likelihood)
+
+    def __mul__(self, factor: float) -> "Objective":
+        scaled = tuple((name, weight * factor) for name, weight in self.errors)
+        return Objective(scaled, self.likelihood * factor)
+
+    __rmul__ = __mul__
+
+    def describe(self) -> str:
+        """The sum in words."""
+        terms = [f"{weight:g} * mean squared {name} error" for name, weight in self.errors]
+        if self.likelihood:
+            terms.append(f"{self.likelihood:g} * negative innovation log-likelihood")
+        return " + ".join(terms)
+
+
+def attitude_error() -> Objective:
+    """Mean squared geodesic angle to the encoder, deg^2."""
+    return Objective((("attitude", 1.0),))
+
+
+def rate_error() -> Objective:
+    """Mean squared rate error, (deg/s)^2."""
+    return Objective((("rate", 1.0),))
+
+
+def innovation_likelihood() -> Objective:
+    """Negative log-likelihood of the innovations, per measured row; needs no truth."""
+    return Objective(likelihood=1.0)
+
+
+NAMED = {
+    "attitude": attitude_error,
+    "rate": rate_error,
+    "likelihood": innovation_likelihood,
+}
+
+
+def parse(text: str) -> Objective:
+    """An objective from ``attitude``, or from a weighted sum such as ``attitude+0.1*likelihood``."""
+    total = Objective()
+    for term in text.split("+"):
+        weight, _, name = term.strip().rpartition("*")
+        try:
+            total = total + NAMED[name.strip()]() * (float(weight) if weight else 1.0)
+        except (KeyError, ValueError):
+            raise TuningError(
+                f"got the objective '{text}', expected a sum of weight*name with the names"
+                f" {sorted(NAMED)}; for instance attitude+0.1*likelihood"
+            ) from None
+    return total
+
+
+def run_batch(model: Model, params: Parameters, data: Data) -> ekf.FilterOutput:
+    """The filter over all runs with shared parameters."""
+    runs = data.steps.dt.shape[0]
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    cov = jax.vmap(model.initial_covariance)(every)
+    return ekf.run_filter_batch(model, every, Belief(data.means, cov), data.steps)
+
+
+def output_values(model: Model, params: Parameters, output: ekf.FilterOutput, name: str) -> Any:
+    """One of the model's outputs at every instant, leading axes (runs, K, S)."""
+
+    def value(x: Any, u: Any) -> Any:
+        return model.output(name).value(x, u, params)
+
+    return jax.vmap(jax.vmap(jax.vmap(value)))(output.instants.updated.mean, output.inputs)
+
+
+def evaluate(model: Model, objective: Objective, params: Parameters, data: Data) -> Array:
+    """The objective of all runs, a scalar with a gradient to every parameter.
+
+    Samples of all runs are pooled, so that a longer run weighs more.
+    """
+    output = run_batch(model, params, data)
+    total = jnp.zeros(())
+    for name, weight in objective.errors:
+        error = output_error(model, params, output, data, name)
+        judged = data.truth[name].judged
+        squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
+        scale = _DEGREES_SQUARED if _is_angular(model, name) else 1.0
+        total = total + weight * scale * squared / jnp.maximum(jnp.sum(judged), 1)
+    if objective.likelihood:
+        likelihood = output.instants.log_likelihood
+        counted = jnp.sum(jnp.where(data.counted, likelihood, 0.0))
+        total = total - objective.likelihood * counted / jnp.maximum(_rows_used(output, data), 1)
+    return total
+
+
+def output_error(
+    model: Model, params: Parameters, output: ekf.FilterOutput, data: Data, name: str
+) -> Array:
+    """Error vector of an output against truth, (runs, K, S, d), in the output's own frame."""
+    if name not in data.truth:
+        raise TuningError(
+            f"got an objective on '{name}', expected one of {sorted(data.truth)} that model"
+            f" '{model.name}' puts out and the encoder knows; choose another objective"
+        )
+    space = model.output(name).space
+    values = output_values(model, params, output, name)
+
+    def error(value: Any, truth: Any) -> Array:
+        return manifold.local(space, value, truth)
+
+    return jax.vmap(jax.vmap(jax.vmap(error)))(values, data.truth[name].value)
+
+
+def _is_angular(model: Model, name: str) -> bool:
+    return manifold.error_units(model.output(name).space)[0].startswith("rad")
+
+
+def _rows_used(output: ekf.FilterOutput, data: Data) -> Array:
+    """Number of rows whose likelihood counts."""
+    total = jnp.zeros((), int)
+    for name, innovation in output.innovations.items():
+        counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
+        total = total + jnp.sum(innovation.used & counted[..., None])
+    return total

@@ -1,0 +1,79 @@
+"""Tables that set estimates beside each other on the same runs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from jaxekf import storage
+from jaxekf.estimate import Run, estimate_many
+from jaxekf.metrics import score, score_hold_last
+from jaxekf.model import Model, Parameters
+from jaxekf.recording import Recording
+from jaxekf.result import Estimate
+
+
+class Row(NamedTuple):
+    """One run under one choice of noise."""
+
+    run: str
+    variant: str
+    attitude_rmse_deg: float
+    rate_rmse_deg_s: float
+    nis: float
+    """Mean normalised innovation squared of the tracker by degree of freedom; 1 where consistent."""
+    nees: float
+    """Mean normalised attitude error squared by degree of freedom; 1 where honest."""
+
+
+class Comparison(NamedTuple):
+    """Rows of all runs and variants, and the estimates they came from."""
+
+    rows: list[Row]
+    estimates: dict[str, list[Estimate]]
+    recordings: list[Recording]
+
+
+def compare(
+    model: str | Model, runs: Sequence[Run], variants: Mapping[str, Parameters]
+) -> Comparison:
+    """Estimate every run with every choice of parameters; the first rows hold the last tracker sample.
+
+    `hold last` has no rate but the gyroscope's own, which is not scored, and no covariance: NaN.
+    """
+    recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+    estimates = {name: estimate_many(recordings, model, p) for name, p in variants.items()}
+    rows: list[Row] = []
+    nan = float("nan")
+    for i, recording in enumerate(recordings):
+        times = next(iter(estimates.values()))[i].time_ns
+        rows.append(
+            Row(recording.name, "hold last", score_hold_last(recording, times), nan, nan, nan)
+        )
+        for name, made in estimates.items():
+            judged = score(made[i], recording)
+            rows.append(
+                Row(
+                    recording.name,
+                    name,
+                    judged.attitude_rmse_deg,
+                    judged.rate_rmse_deg_s,
+                    made[i].mean_nis("optical"),
+                    judged.attitude_nees,
+                )
+            )
+    return Comparison(rows, estimates, recordings)
+
+
+def mean_by_variant(rows: Sequence[Row], field: str = "attitude_rmse_deg") -> dict[str, float]:
+    """Mean over the runs of one column, by variant."""
+    grouped: dict[str, list[float]] = {}
+    for row in rows:
+        grouped.setdefault(row.variant, []).append(float(getattr(row, field)))
+    return {name: sum(values) / len(values) for name, values in grouped.items()}
+
+
+def as_dicts(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Rows for JSON; what is not known is None."""
+    return [
+        {key: None if isinstance(v, float) and v != v else v for key, v in row._asdict().items()}
+        for row in rows
+    ]

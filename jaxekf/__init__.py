@@ -4,6 +4,7 @@ JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
 """
 
 from jaxekf import manifold, rotation
+from jaxekf.datasets import demo
 from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
 from jaxekf.errors import (
     FilterError,
@@ -13,7 +14,7 @@ from jaxekf.errors import (
     RecordingError,
     TuningError,
 )
-from jaxekf.estimate import estimate, estimate_many
+from jaxekf.estimation import estimate, estimate_many
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
 from jaxekf.metrics import Score, score
@@ -55,6 +56,7 @@ __all__ = [
     "Sensor",
     "SensorRecord",
     "TuningError",
+    "demo",
     "estimate",
     "estimate_many",
     "get_model",

@@ -89,6 +89,20 @@ def _euler_deg(q: Floats) -> Floats:
     return np.rad2deg(np.unwrap(angles, axis=0))
 
 
+def _euler_sigma_deg(q: Floats, cov: Floats) -> Floats:
+    """Standard deviation (N, 3) of roll, pitch and yaw from the body-frame covariance, degrees."""
+    _, pitch, roll = to_scipy(q).as_euler("ZYX").T
+    cosine = np.maximum(np.abs(np.cos(pitch)), 1e-3)
+    zero, one = np.zeros_like(roll), np.ones_like(roll)
+    rows = [
+        [one, np.sin(roll) * np.sin(pitch) / cosine, np.cos(roll) * np.sin(pitch) / cosine],
+        [zero, np.cos(roll), -np.sin(roll)],
+        [zero, np.sin(roll) / cosine, np.cos(roll) / cosine],
+    ]
+    slope = np.moveaxis(np.array(rows), 2, 0)
+    return np.rad2deg(np.sqrt(np.einsum("nij,njk,nik->ni", slope, cov, slope)))
+
+
 def _band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None) -> None:
     axes.fill_between(
         t, centre - 2 * sigma, centre + 2 * sigma, color=ESTIMATE, alpha=0.22, lw=0, label=label
@@ -115,6 +129,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
             _euler_deg(estimate.attitude.value),
             _euler_deg(optical.q_ref_body[seen]),
         )
+        sigma = _euler_sigma_deg(estimate.attitude.value, estimate.attitude.cov)
         known = (
             None
             if truth is None
@@ -127,6 +142,8 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
             if known is not None:
                 axes.plot(t, known[:, i], color=TRUTH, lw=2.2, label="encoder")
             axes.plot(t, estimated[:, i], color=ESTIMATE, lw=1, label="estimate")
+            if truth is None:
+                _band(axes, t, estimated[:, i], sigma[:, i], "2σ of the estimate")
             axes.set_ylabel(f"{name} (deg)")
         if truth is not None:
             _attitude_errors(grid[:, 1], estimate, recording, truth)
@@ -279,6 +296,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
         estimated = estimate.attitude.value[near]
         t, sigma = estimate.time[near], np.rad2deg(estimate.attitude.sigma[near])
         angles = [_euler_deg(held), _euler_deg(estimated)]
+        euler_sigma = _euler_sigma_deg(estimated, estimate.attitude.cov[near])
         truth = encoder_at(recording.encoder, estimate.time_ns[near]) if recording.encoder else None
         for i, name in enumerate(("roll", "pitch", "yaw")):
             axes = grid[i, 0]
@@ -296,6 +314,8 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
                     t, _euler_deg(truth.q_ref_body)[:, i], color=TRUTH, lw=2.2, label="encoder"
                 )
             axes.plot(t, angles[1][:, i], color=ESTIMATE, lw=1.2, label="estimate")
+            if truth is None:
+                _band(axes, t, angles[1][:, i], euler_sigma[:, i], "2σ of the estimate")
             axes.set_ylabel(f"{name} (deg)")
             axes.set_xlim(begin - margin, end + margin)
         if truth is not None:

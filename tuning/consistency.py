@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf.estimate import evaluate_outputs
+from jaxekf.estimation import evaluate_outputs
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
 from tuning.objectives import output_error, run_batch

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxekf import storage, timeline
 from jaxekf.errors import TuningError
-from jaxekf.estimate import Run, bucketed
+from jaxekf.estimation import Run, bucketed
 from jaxekf.model import Model
 from jaxekf.recording import Recording, encoder_at, encoder_rate_at
 from jaxekf.timeline import Steps, Timeline

@@ -15,7 +15,7 @@ from jax import Array
 
 from jaxekf import parameters
 from jaxekf.errors import TuningError
-from jaxekf.estimate import Run, provenance, require_float64
+from jaxekf.estimation import Run, provenance, require_float64
 from jaxekf.model import Model, Parameters
 from jaxekf.models import get_model
 from jaxekf.recording import Recording

@@ -121,14 +121,17 @@ def layout(model: Model, params: Parameters, free: Sequence[str] | None = None) 
 def _leaf(name: str, value: Any, unit: str) -> Leaf:
     if name.startswith("calibration."):
         return Leaf(name, value.shape, "linear", _NATURAL_STEP.get(unit, 1.0))
-    kind = "factor" if value.ndim == 2 else "log"
-    deviations = np.diagonal(value) if kind == "factor" else value
+    _check_positive(name, value)
+    return Leaf(name, value.shape, "factor" if value.ndim == 2 else "log")
+
+
+def _check_positive(name: str, value: Any) -> None:
+    deviations = np.diagonal(value) if value.ndim == 2 else value
     if not np.all(np.isfinite(deviations) & (deviations > 0.0)):
         raise TuningError(
             f"got {name} = {value.tolist()} to start from, expected positive deviations;"
             " start from a small positive number"
         )
-    return Leaf(name, value.shape, kind)
 
 
 def with_axes(model: Model, params: Parameters, axes: str) -> Parameters:
@@ -138,6 +141,7 @@ def with_axes(model: Model, params: Parameters, axes: str) -> Parameters:
 
     def reshape(value: Any, dim: int) -> Any:
         value = np.asarray(value, float)
+        _check_positive("noise", value)
         cov = value @ value.T if value.ndim == 2 else np.diag(np.broadcast_to(value, dim) ** 2)
         if axes == "full":
             return np.linalg.cholesky(cov)

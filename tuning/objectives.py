@@ -103,19 +103,35 @@ def evaluate(model: Model, objective: Objective, params: Parameters, data: Data)
 
     Samples of all runs are pooled, so that a longer run weighs more.
     """
-    output = run_batch(model, params, data)
-    total = jnp.zeros(())
+    weights: dict[str, float] = {}
     for name, weight in objective.errors:
+        weights[name] = weights.get(name, 0.0) + weight
+    if objective.likelihood:
+        weights["likelihood"] = objective.likelihood
+    found = terms(model, params, data, tuple(weights))
+    return sum((weight * found[name] for name, weight in weights.items()), jnp.zeros(()))
+
+
+def terms(model: Model, params: Parameters, data: Data, names: tuple[str, ...]) -> dict[str, Array]:
+    """Single terms of an objective, unweighted, from one run of the filter.
+
+    An output's name stands for its mean squared error, ``likelihood`` for the negative mean
+    log-likelihood of a measured row.
+    """
+    output = run_batch(model, params, data)
+    found: dict[str, Array] = {}
+    for name in names:
+        if name == "likelihood":
+            likelihood = jnp.where(data.counted, output.instants.log_likelihood, 0.0)
+            rows = jnp.maximum(_rows_used(output, data), 1)
+            found[name] = -jnp.sum(likelihood) / rows
+            continue
         error = output_error(model, params, output, data, name)
         judged = data.truth[name].judged
         squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
         scale = _DEGREES_SQUARED if _is_angular(model, name) else 1.0
-        total = total + weight * scale * squared / jnp.maximum(jnp.sum(judged), 1)
-    if objective.likelihood:
-        likelihood = output.instants.log_likelihood
-        counted = jnp.sum(jnp.where(data.counted, likelihood, 0.0))
-        total = total - objective.likelihood * counted / jnp.maximum(_rows_used(output, data), 1)
-    return total
+        found[name] = scale * squared / jnp.maximum(jnp.sum(judged), 1)
+    return found
 
 
 def output_error(

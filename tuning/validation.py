@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxekf import storage
-from jaxekf.estimate import Run, estimate_many
+from jaxekf.estimation import Run, estimate_many
 from jaxekf.metrics import score, score_hold_last
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Recording

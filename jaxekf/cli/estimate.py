@@ -18,7 +18,7 @@ from jaxekf.cli.console import (
     print_table,
 )
 from jaxekf.errors import RecordingError
-from jaxekf.estimate import estimate_many
+from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate

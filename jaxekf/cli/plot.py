@@ -7,7 +7,7 @@ import click
 from jaxekf import parameters, plots
 from jaxekf.cli.console import json_option, model_option, noise_option, note, print_json
 from jaxekf.cli.estimate import load_runs
-from jaxekf.estimate import estimate_many
+from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate

@@ -1,0 +1,5 @@
+"""`python -m jaxekf`."""
+
+from jaxekf.cli import main
+
+main(prog_name="jaxekf")

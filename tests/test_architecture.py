@@ -1,0 +1,121 @@
+"""The rules of the architecture: which way imports run, and who may know what."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import jaxekf
+import tuning
+
+ROOT = Path(__file__).parents[1]
+# A module may import those before it. What stands in one entry does not import its neighbours.
+ORDER = [
+    ("errors",),
+    ("rotation", "linalg", "recording"),
+    ("manifold",),
+    ("model",),
+    ("timeline",),
+    ("interpolation",),
+    ("ekf", "models.sources", "storage"),
+    ("models.loose",),
+    ("models.loose_rate", "models.loose_additive"),
+    ("models",),
+    ("parameters",),
+    ("result",),
+    ("estimation",),
+    ("metrics", "simulate"),
+    ("datasets", "datasets.broad", "datasets.demo"),
+    ("plots",),
+    ("cli.console",),
+    ("cli.simulate", "cli.estimate"),
+    ("cli.plot", "cli.tune"),
+    ("cli.demo",),
+    ("cli",),
+    ("__main__",),
+]
+RANK = {name: i for i, names in enumerate(ORDER) for name in names}
+
+
+def module_name(file):
+    parts = file.relative_to(ROOT / "jaxekf").with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(file):
+    """Every module a file imports, ``from a import b`` as ``a.b`` where that is a module."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                is_module = (ROOT / (name.replace(".", "/") + ".py")).exists()
+                is_package = (ROOT / name.replace(".", "/") / "__init__.py").exists()
+                yield name if is_module or is_package else node.module
+
+
+FILES = sorted((ROOT / "jaxekf").rglob("*.py"))
+
+
+@pytest.mark.parametrize("file", FILES, ids=module_name)
+def test_imports_run_one_way(file):
+    """Would catch a cycle, or a core that comes to know its models or its command line."""
+    name = module_name(file)
+    if name == "":
+        return
+    for imported in imports(file):
+        if imported == "jaxekf" or not imported.startswith("jaxekf."):
+            continue
+        other = imported.removeprefix("jaxekf.")
+        if other == "__version__":
+            continue
+        assert RANK[other] < RANK[name], f"{name} imports {other}"
+
+
+@pytest.mark.parametrize("file", FILES, ids=module_name)
+def test_who_may_know_what(file):
+    """Would catch matplotlib outside plots, optax outside tuning, and tuning outside the command line."""
+    name, tops = module_name(file), {m.split(".")[0] for m in imports(file)}
+    assert "matplotlib" not in tops or name == "plots"
+    assert "optax" not in tops
+    assert "tuning" not in tops or name.startswith("cli")
+    assert not ({"click", "rich"} & tops) or name.startswith("cli")
+
+
+@pytest.mark.parametrize("package", [jaxekf, tuning])
+def test_public_names_are_documented(package):
+    """Would catch a public name that is gone, or has no docstring of its own."""
+    assert package.__all__ == sorted(
+        package.__all__, key=lambda n: (not n.isupper(), n.islower(), n)
+    )
+    for name in package.__all__:
+        thing = getattr(package, name)
+        assert (thing.__doc__ or "").strip(), name
+
+
+@pytest.mark.parametrize("folder", ["jaxekf", "tuning"])
+def test_functions_stay_short(folder):
+    """Would catch the 700-line step function."""
+    for file in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                length = (node.end_lineno or 0) - node.lineno
+                assert length <= 90, f"{file.name}:{node.name} has {length} lines"
+
+
+def test_packages_are_typed():
+    """Would catch a release that type checkers ignore."""
+    for package in (jaxekf, tuning):
+        assert (Path(package.__file__).parent / "py.typed").is_file()
+
+
+def test_ci_runs_the_command_of_the_readme():
+    """Would catch a README whose test command is not the one that is known to work."""
+    readme = (ROOT / "README.md").read_text()
+    commands = re.findall(r"^python3 -m venv .*$", readme, re.M)
+    assert len(commands) == 2
+    assert "jaxekf demo" in commands[0]
+    assert "pytest" in commands[1]
+    assert "README.md" in (ROOT / ".ci" / "run").read_text()

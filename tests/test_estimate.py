@@ -1,0 +1,169 @@
+"""The host's side: one call for one run, the same for many, exact accounts, and errors in a sentence."""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxekf
+from jaxekf import estimation as host
+from jaxekf import metrics, simulate, timeline
+from jaxekf.datasets import demo
+from jaxekf.errors import FilterError, ModelError, PrecisionError
+from jaxekf.models import REGISTRY
+from jaxekf.parameters import as_arrays
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def record(seed=1, duration_s=4.0, **kwargs):
+    return simulate.recording(
+        f"run-{seed}",
+        simulate.free_motion(seed, rest_s=0.5),
+        seed=seed,
+        duration_s=duration_s,
+        **kwargs,
+    )
+
+
+def test_many_equal_single_calls_with_one_compilation():
+    """Would catch runs that leak into each other in a batch (row 11), or a program compiled anew."""
+    records = [record(seed, 2.0) for seed in range(64)]
+    together = jaxekf.estimate_many(records)
+    singles = [jaxekf.estimate(records[0])]
+    before = host._run._cache_size()
+    singles += [jaxekf.estimate(r) for r in records[1:]]
+    assert host._run._cache_size() == before
+    for one, other in zip(together, singles, strict=True):
+        np.testing.assert_allclose(one.attitude.value, other.attitude.value, atol=1e-9)
+        np.testing.assert_allclose(one.cov, other.cov, atol=1e-9)
+        assert one.log_likelihood == pytest.approx(other.log_likelihood, rel=1e-9)
+
+
+def test_unequal_lengths_and_buckets():
+    """Would catch padding that changes a result, or one program for every length."""
+    records = [record(seed, 2.0 + 0.02 * seed) for seed in range(6)]
+    together = jaxekf.estimate_many(records)
+    before = host._run._cache_size()
+    singles = [jaxekf.estimate(r) for r in records]
+    assert host._run._cache_size() - before <= 2
+    for one, other, r in zip(together, singles, records, strict=True):
+        assert one.time_ns[-1] == r.need_imu().time_ns[-1]
+        np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 9, 1000, 1025])
+def test_buckets_waste_little(count):
+    """Would catch buckets that are too small or too coarse."""
+    assert count <= timeline.bucket(count) <= max(1.26 * count, count + 1)
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_account_is_exact(name):
+    """Would catch rows that vanish: read = used + masked + gated + dropped."""
+    r = record(3, occlusions=[(1.0, 1.5)], dropouts=0.05)
+    r = r.replace(imu=r.imu.__class__(r.imu.time_ns + 20_000_000, r.imu.gyroscope))
+    made = jaxekf.estimate(r, name)
+    for stream, count in made.account.items():
+        assert count["read"] == sum(v for k, v in count.items() if k != "read"), (stream, count)
+    optical = made.account["optical"]
+    # The tracker's first two samples come before the gyroscope's first.
+    assert optical["dropped_outside_run"] >= 2 or name == "loose_additive" or name == "loose_rate"
+    assert optical["masked"] >= 31
+
+
+def test_result_is_named_and_complete(tmp_path):
+    """Would catch a result that cannot be used without the source at hand."""
+    made = jaxekf.estimate(record())
+    assert made.attitude.value.shape == (len(made.time_ns), 4)
+    assert made.rate.frame == "body"
+    assert made.bias.unit == "rad/s"
+    assert made.error_labels[0] == "q_ref_body_x"
+    assert made.cov.shape == (len(made.time_ns), 6, 6)
+    np.testing.assert_allclose(np.linalg.norm(made.attitude.value, axis=1), 1.0, atol=1e-12)
+    with pytest.raises(KeyError, match="expected one of"):
+        made.part("biass")
+    folder = made.save(tmp_path / "result")
+    names = {p.name for p in folder.iterdir()}
+    assert names == {
+        "estimate.csv",
+        "covariance.npz",
+        "innovations_optical.csv",
+        "noise.toml",
+        "calibration.toml",
+        "result.json",
+    }
+    with np.load(folder / "covariance.npz") as arrays:
+        np.testing.assert_array_equal(arrays["time_ns"], made.time_ns)
+        np.testing.assert_array_equal(arrays["cov"], made.cov)
+    head = (folder / "estimate.csv").read_text().splitlines()
+    assert head[0].startswith("time,q_ref_body_w,")
+    assert len(head) == len(made.time_ns) + 1
+
+
+def test_rate_covariance_holds_for_the_rate(tmp_path):
+    """Would catch a rate output without the gyroscope's own noise, or with it at the wrong bandwidth."""
+    r = simulate.recording("run", simulate.free_motion(2), seed=2, duration_s=60.0)
+    made = jaxekf.estimate(r)
+    from jaxekf.recording import encoder_rate_at
+
+    error = made.rate.value - encoder_rate_at(r.need_encoder(), made.time_ns)
+    known = np.isfinite(error).all(axis=1) & (made.time > 5.0)
+    nees = metrics.normalised_square(error[known], made.rate.cov[known]) / 3.0
+    assert nees.mean() == pytest.approx(1.0, abs=0.06)
+
+
+def test_float32_is_refused_in_a_sentence():
+    """Would catch variances that are wrong by tens of percent without a word."""
+    with jax.enable_x64(False), pytest.raises(PrecisionError, match="jax_enable_x64"):
+        jaxekf.estimate(record())
+
+
+def test_broken_recursion_names_run_step_and_sensor():
+    """Would catch NaN in a result, or an error that does not say where."""
+    params = as_arrays(jaxekf.get_model("loose").parameters)
+    zero = params._replace(noise=params.noise._replace(optical=np.float64(np.nan)))
+    with pytest.raises(FilterError) as caught:
+        jaxekf.estimate(record(), "loose", zero)
+    for word in ("run-1", "step", " s,", "optical", "expected"):
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("lose", "expected one of"),
+        ("no_such_module:MODEL", "no_such_module"),
+        ("math:pi", "type float"),
+    ],
+)
+def test_unknown_models_are_refused(name, words):
+    """Would catch a traceback for a misspelt model."""
+    with pytest.raises(ModelError, match=words):
+        jaxekf.get_model(name)
+
+
+def test_own_model_without_editing_the_package(monkeypatch):
+    """Would catch a core that only knows its own models: nine states, written by a user."""
+    monkeypatch.chdir(README.parent / "examples")
+    r = jaxekf.load(demo.FOLDER / "free-5")
+    imu = r.need_imu()
+    scaled = r.replace(imu=imu.__class__(imu.time_ns, imu.gyroscope * np.array([1.02, 0.99, 1.01])))
+    made = jaxekf.estimate(scaled, "own_model:MODEL")
+    part = made.part("scale")
+    assert np.all(np.abs(part.value[-1] - [0.02, -0.01, 0.01]) < 4 * part.sigma[-1])
+    assert np.all(part.sigma[-1] < 3e-3)
+    better = jaxekf.score(made, scaled).attitude_rmse_deg
+    assert better < jaxekf.score(jaxekf.estimate(scaled), scaled).attitude_rmse_deg
+
+
+def test_readme_lines_run(capsys):
+    """Would catch a README whose Python does not work (row 11)."""
+    block = re.search(r"```python\n(.*?)```", README.read_text(), re.S)
+    assert block is not None
+    lines = [line for line in block.group(1).splitlines() if line.strip()]
+    assert len(lines) == 5
+    exec(compile("\n".join(lines), "README", "exec"), {})
+    assert "free-5" in capsys.readouterr().out

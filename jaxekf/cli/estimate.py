@@ -81,11 +81,11 @@ def estimate(
     columns = [
         "run",
         "seconds",
-        "attitude RMSE (deg)",
-        "rate RMSE (deg/s)",
+        "attitude RMSE\n(deg)",
+        "rate RMSE\n(deg/s)",
         "NEES",
-        "tracker NIS",
-        "masked",
+        "tracker\nNIS",
+        "tracker rows\nmasked",
     ]
     print_table(f"Estimates by {chosen.name}", columns, rows)
 

@@ -164,7 +164,7 @@ def _short(value: object) -> str:
 
 def print_comparison(title: str, rows: list[tuning.Row]) -> None:
     """The table that sets variants beside each other, run by run and on average."""
-    columns = ["run", "noise", "attitude RMSE (deg)", "rate RMSE (deg/s)", "tracker NIS", "NEES"]
+    columns = ["run", "noise", "attitude RMSE\n(deg)", "rate RMSE\n(deg/s)", "tracker\nNIS", "NEES"]
     shown = [list(row) for row in rows]
     fields = ("attitude_rmse_deg", "rate_rmse_deg_s", "nis", "nees")
     means = {field: tuning.mean_by_variant(rows, field) for field in fields}

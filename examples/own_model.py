@@ -107,7 +107,14 @@ MODEL = Model(
     input=Input("gyroscope", sources.gyroscope),
     outputs=(
         Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: rate(x, u.value)),
+        Output(
+            "rate",
+            Euclidean(3, "rad/s"),
+            "body",
+            value=lambda x, u, params: rate(x, u.value),
+            # What is not in the state: the white noise of the gyroscope's own sample.
+            noise=lambda u, params: linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth,
+        ),
     ),
 )
 

@@ -3,7 +3,7 @@
 JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
 """
 
-from jaxekf import manifold, rotation
+from jaxekf import manifold, rotation, timeline
 from jaxekf.datasets import demo
 from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
 from jaxekf.errors import (
@@ -70,4 +70,5 @@ __all__ = [
     "save",
     "save_parameters",
     "score",
+    "timeline",
 ]

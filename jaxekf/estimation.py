@@ -51,6 +51,7 @@ def estimate_many(
     recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
     timelines = timeline.build_many(chosen, recordings)
     used = parameters.as_arrays(chosen.parameters if params is None else params)
+    parameters.check(used)
     firsts = [line.first for line in timelines]
     results = filter_timelines(chosen, used, firsts, timelines)
     return [
@@ -131,19 +132,29 @@ def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
         return
     k, s = (int(i) for i in broken[0])
     seconds = (line.time_ns[k, s] - line.time_ns[0, -1]) / NANOSECONDS
-    blamed = []
-    for name in model_sensors(line):
-        innovation = output.innovations[name]
-        index = (k, s) if name in line.steps.fast else (k,)
-        diagonal = np.diagonal(np.asarray(innovation.cov)[index])
-        if not np.all(np.isfinite(diagonal) & (diagonal > 0.0)):
-            blamed.append(name)
+    blamed = _blame(line, output, k, s)
     raise FilterError(
         f"run '{line.name}': got a covariance that is not finite and definite at step {k * substeps + s},"
-        f" {seconds:.6f} s, sensor {' and '.join(blamed) or 'none (prediction)'} of model"
+        f" {seconds:.6f} s, {blamed} of model"
         f" '{model.name}', expected a definite one; look for wrong units in the data or noise that is"
         " zero, negative or not finite"
     )
+
+
+def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
+    """The sensors used at a broken substep, or the prediction where that was broken already."""
+    predicted = np.diagonal(np.asarray(output.instants.predicted.cov)[: len(line.time_ns)][k, s])
+    if not np.all(np.isfinite(predicted) & (predicted >= 0.0)):
+        return "in the prediction"
+    last = s == line.time_ns.shape[1] - 1
+    used = []
+    for name in model_sensors(line):
+        fast = name in line.steps.fast
+        if (fast or last) and np.asarray(output.innovations[name].used)[
+            (k, s) if fast else k
+        ].any():
+            used.append(name)
+    return f"in the update by sensor {' and '.join(used)}"
 
 
 def model_sensors(line: Timeline) -> list[str]:
@@ -177,6 +188,9 @@ def _collect(
             rejected = int((record.gated.any(axis=1) & ~record.used.any(axis=1)).sum())
             account[name]["gated"] = rejected
             account[name]["used"] = account[name].pop("fed") - rejected
+    for count in account.values():
+        if "fed" in count:
+            count["used"] = count.pop("fed")
     named = {}
     for name, (value, cov) in outputs.items():
         out = model.output(name)

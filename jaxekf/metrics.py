@@ -49,19 +49,20 @@ def normalised_square(error: Floats, cov: Floats) -> Floats:
 
 
 def score(estimate: Estimate, recording: Recording, burn_in_s: float = 0.0) -> Score:
-    """Attitude and rate error, and attitude NEES, on the encoder's scored samples."""
+    """Attitude and rate error, and attitude NEES, at those instants of the estimate whose nearest
+    encoder sample is scored; NaN for what the model does not put out."""
     truth = encoder_at(recording.need_encoder(), estimate.time_ns)
     judged = truth.scored & (estimate.time >= burn_in_s)
-    error = attitude_error(estimate.attitude.value[judged], truth.q_ref_body[judged])
-    true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
-    rate_error = estimate.rate.value[judged] - true_rate
-    nees = normalised_square(error, estimate.attitude.cov[judged])
-    return Score(
-        attitude_rmse_deg=float(np.rad2deg(rms(error))),
-        rate_rmse_deg_s=float(np.rad2deg(rms(rate_error))),
-        attitude_nees=float(np.mean(nees) / 3.0) if nees.size else float("nan"),
-        samples=int(judged.sum()),
-    )
+    attitude = rate = nees = float("nan")
+    if "attitude" in estimate.outputs:
+        error = attitude_error(estimate.attitude.value[judged], truth.q_ref_body[judged])
+        attitude = float(np.rad2deg(rms(error)))
+        squared = normalised_square(error, estimate.attitude.cov[judged])
+        nees = float(np.mean(squared) / 3.0) if squared.size else nees
+    if "rate" in estimate.outputs:
+        true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
+        rate = float(np.rad2deg(rms(estimate.rate.value[judged] - true_rate)))
+    return Score(attitude, rate, nees, int(judged.sum()))
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:

@@ -54,8 +54,8 @@ class Sensor:
     predict: Predict
     """``predict(x, u, params, aux)``: the sample without noise; ``u`` is an `InputSample`."""
     noise: SensorNoise
-    """``noise(params, aux, dt)``: covariance (rows, rows) of a sample; ``dt`` is the time in seconds
-    since the sensor's previous sample."""
+    """``noise(params, aux, dt)``: covariance (rows, rows) of a sample; ``dt`` is the sensor's own
+    sampling period in seconds."""
     source: Source | None = None
     """Where a recording holds the samples; None for a sensor that is fed from arrays only."""
     groups: tuple[int, ...] | None = None

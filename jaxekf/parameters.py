@@ -54,15 +54,21 @@ def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> 
 def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]) -> None:
     """Write `noise.toml` (noise and initial belief) and `calibration.toml` into a folder, each whole.
 
+    Raises `ModelError` for deviations that are not positive and finite.
+
     ``value_deg`` beside a value in radians is for reading only.
     """
+    check(params)
     document = to_document(model, params, origin)
     head = {key: document[key] for key in ("schema_version", "model", "origin")}
     noise = head | {"noise": document["noise"], "initial": document["initial"]}
     write_whole(Path(path) / "noise.toml", tomli_w.dumps(noise))
+    file = Path(path) / "calibration.toml"
     if document["calibration"]:
-        calibration = head | {"calibration": document["calibration"]}
-        write_whole(Path(path) / "calibration.toml", tomli_w.dumps(calibration))
+        write_whole(file, tomli_w.dumps(head | {"calibration": document["calibration"]}))
+    else:
+        # What an earlier model left there must not be read beside this one's noise.
+        file.unlink(missing_ok=True)
 
 
 def load(model: Model, *paths: Path | str) -> Parameters:
@@ -103,15 +109,41 @@ def _read(path: Path, model: Model, params: Parameters) -> Parameters:
             f"{path}: got parameters of the model '{document.get('model')}', expected those of"
             f" '{model.name}'; choose that model or tune this one"
         )
+    unknown = set(document) - {"schema_version", "model", "origin", *_SECTIONS}
+    if unknown:
+        raise RecordingError(
+            path,
+            f"sections {sorted(unknown)}",
+            f"some of {list(_SECTIONS)}",
+            "correcting the names",
+        )
     for section in _SECTIONS:
         if section in document:
-            values = _fill(path, section, getattr(params, section), document[section])
+            units = getattr(model.units, section)
+            values = _fill(path, section, getattr(params, section), units, document[section])
             params = params._replace(**{section: values})
+    check(params, str(path))
     return params
 
 
-def _fill(path: Path, section: str, default: Any, entries: Mapping[str, Any]) -> Any:
+def check(params: Parameters, place: str = "parameters") -> None:
+    """Raise `ModelError` for a noise or initial deviation that is not positive and finite."""
+    for section in ("noise", "initial"):
+        tree = getattr(params, section)
+        for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True):
+            value = np.asarray(leaf, float)
+            deviations = np.diagonal(value) if value.ndim == 2 else value
+            if not (np.all(np.isfinite(value)) and np.all(deviations > 0.0)):
+                raise ModelError(
+                    f"{place}: got {section}.{name} = {value.tolist()}, expected positive standard"
+                    " deviations; try a small positive number for what is nearly exact"
+                )
+
+
+def _fill(path: Path, section: str, default: Any, units: Any, entries: Any) -> Any:
     names = leaf_names(default)
+    if not isinstance(entries, dict):
+        raise RecordingError(path, f"{section} = {entries!r}", "a section", f"[{section}.NAME]")
     unknown = set(entries) - set(names)
     if unknown:
         raise RecordingError(
@@ -119,17 +151,34 @@ def _fill(path: Path, section: str, default: Any, entries: Mapping[str, Any]) ->
         )
     leaves, structure = jax.tree.flatten(default)
     filled = []
-    for name, leaf in zip(names, leaves, strict=True):
-        value = np.asarray(entries[name]["value"], float) if name in entries else leaf
-        # Noise may be given for all axes, for each, or as a factor; calibration keeps its shape.
-        if not np.all(np.isfinite(value)) or (
-            section == "calibration" and np.shape(value) != np.shape(leaf)
-        ):
-            raise RecordingError(
-                path,
-                f"{section}.{name} = {entries[name]['value']}",
-                f"finite numbers of shape {np.shape(leaf)}",
-                "correcting the value",
-            )
-        filled.append(value)
+    for name, unit, leaf in zip(names, jax.tree.leaves(units), leaves, strict=True):
+        if name in entries:
+            leaf = _value(path, f"{section}.{name}", entries[name], unit, np.shape(leaf))
+        filled.append(leaf)
     return jax.tree.unflatten(structure, filled)
+
+
+def _value(path: Path, name: str, entry: Any, unit: str, shape: tuple[int, ...]) -> Any:
+    """One leaf: noise may be given for all axes, each or as a factor; calibration keeps its shape."""
+    if not isinstance(entry, dict) or "value" not in entry:
+        raise RecordingError(
+            path,
+            f"{name} = {entry!r}",
+            "an entry with value and unit",
+            f'value = ..., unit = "{unit}"',
+        )
+    if entry.get("unit", unit) != unit:
+        raise RecordingError(path, f"{name} in {entry['unit']}", unit, "converting the value")
+    try:
+        value = np.asarray(entry["value"], float)
+    except (TypeError, ValueError):
+        value = np.full(1, np.nan)
+    known = {shape} if name.startswith("calibration") else {(), (3,), (4,), (3, 3), (4, 4), shape}
+    if value.shape not in known or not np.all(np.isfinite(value)):
+        raise RecordingError(
+            path,
+            f"{name} = {entry['value']!r}",
+            f"finite numbers of a shape in {sorted(known, key=str)}",
+            "correcting the value",
+        )
+    return value

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from jaxekf import manifold
 from jaxekf.metrics import attitude_error, hold_last, rms
 from jaxekf.recording import (
     NANOSECONDS,
@@ -38,7 +39,7 @@ _STYLE: Any = {
 
 
 def figure_functions() -> dict[str, Callable[[Estimate, Recording], Figure]]:
-    """Every figure by its file name; those that need a stream the run lacks raise `RecordingError`."""
+    """Every figure by its file name."""
     return {
         "attitude": attitude,
         "rate": rate,
@@ -46,6 +47,21 @@ def figure_functions() -> dict[str, Callable[[Estimate, Recording], Figure]]:
         "occlusion": occlusion,
         "path": path,
     }
+
+
+def possible_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...]:
+    """Names of the figures that this model and recording can show."""
+    if recording.optical is None or len(estimate.time_ns) < 10:
+        return ()
+    parts = {part.name for part in manifold.parts(estimate.model.space)}
+    needs = {
+        "attitude": "attitude" in estimate.outputs,
+        "rate": "rate" in estimate.outputs and recording.imu is not None,
+        "bias": "bias" in parts and recording.imu is not None,
+        "occlusion": "attitude" in estimate.outputs,
+        "path": "attitude" in estimate.outputs and "marker_body" in recording.info,
+    }
+    return tuple(name for name in figure_functions() if needs[name])
 
 
 def save(figure: Figure, file: Path | str) -> Path:
@@ -357,7 +373,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
 
 def path(estimate: Estimate, recording: Recording) -> Figure:
     """3-D path of a marker on the tool, which turns about the origin of the tracker's frame."""
-    marker = np.asarray(recording.info.get("marker_body", [0.1, 0.0, 0.0]), float)
+    marker = np.asarray(recording.info["marker_body"], float)
     optical = recording.need_optical()
     seen = optical.valid & (optical.time_ns >= estimate.time_ns[0])
     measured = 1e3 * (

@@ -88,6 +88,13 @@ class Recording:
     path: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):
+            raise RecordingError(
+                self.path or "recording",
+                f"the name {self.name!r}",
+                "a name that can be a folder's",
+                "changing it in recording.toml",
+            )
         for label in ("optical", "imu", "encoder"):
             stream = getattr(self, label)
             if stream is not None:
@@ -204,10 +211,11 @@ def encoder_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> 
     return Encoder(time_ns, q, valid, valid & (encoder.scored & encoder.valid)[nearest])
 
 
-def encoder_rate_at(encoder: Encoder, time_ns: Times) -> Floats:
+def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Floats:
     """Body rate (N, 3), rad/s, at other times; NaN where the encoder does not tell.
 
-    Central differences of the encoder's attitude, interpolated linearly.
+    Central differences of the encoder's attitude, interpolated linearly, neither of them over gaps
+    longer than `longest_gap_s`.
     """
     if len(encoder.time_ns) < 3:
         return np.full((len(time_ns), 3), np.nan)
@@ -215,11 +223,16 @@ def encoder_rate_at(encoder: Encoder, time_ns: Times) -> Floats:
     span = (encoder.time_ns[2:] - encoder.time_ns[:-2])[:, None] / NANOSECONDS
     rate = (before.inv() * after).as_rotvec() / span
     rate[~(encoder.valid[:-2] & encoder.valid[1:-1] & encoder.valid[2:])] = np.nan
+    wide = np.diff(encoder.time_ns) > longest_gap_s * NANOSECONDS
+    rate[wide[:-1] | wide[1:]] = np.nan
     middle = encoder.time_ns[1:-1]
     seconds = (middle - middle[0]) / NANOSECONDS
     asked = (time_ns - middle[0]) / NANOSECONDS
     columns = [np.interp(asked, seconds, rate[:, i], left=np.nan, right=np.nan) for i in range(3)]
-    return np.stack(columns, axis=1)
+    found = np.stack(columns, axis=1)
+    upper = _bracket(encoder.time_ns, time_ns)
+    found[wide[upper - 1] & (encoder.time_ns[upper] != time_ns)] = np.nan
+    return found
 
 
 def _bracket(times: Times, asked: Times) -> NDArray[np.intp]:

@@ -110,7 +110,7 @@ class Estimate:
         """Mean normalised innovation squared by degree of freedom; 1 where the noise is right."""
         record = self.sensors[sensor]
         rows = (record.used | record.gated).sum(axis=1)
-        return float(record.nis[rows > 0].sum() / max(rows.sum(), 1))
+        return float(record.nis[rows > 0].sum() / rows.sum()) if rows.any() else float("nan")
 
     def summary(self) -> dict[str, Any]:
         """Numbers that say how the run went, for JSON."""
@@ -120,7 +120,10 @@ class Estimate:
             "instants": len(self.time_ns),
             "duration_s": float(self.time[-1]),
             "log_likelihood": self.log_likelihood,
-            "mean_nis": {name: self.mean_nis(name) for name in self.sensors},
+            "mean_nis": {
+                name: self.mean_nis(name) if len(record.nis) else None
+                for name, record in self.sensors.items()
+            },
             "account": self.account,
         }
 
@@ -131,42 +134,50 @@ class Estimate:
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
         account and provenance.
         """
-        with whole_folder(path, overwrite=overwrite) as folder:
+        with whole_folder(path, "result.json", overwrite=overwrite) as folder:
             columns, values = self._table()
-            write_csv(folder / "estimate.csv", columns, self.time_ns, values, 12)
+            names = [column["name"] for column in columns]
+            write_csv(folder / "estimate.csv", names, self.time_ns, values, 12)
             self._save_covariance(folder / "covariance.npz")
             for name, record in self.sensors.items():
                 labels = manifold.error_labels(self.model.sensor(name).space)
-                rows = np.arange(record.residual.shape[1])
-                sigma = np.sqrt(record.cov[:, rows, rows])
-                hidden = np.where(record.used, 0.0, np.nan)
-                table = np.c_[record.residual + hidden, sigma + hidden, record.nis]
-                heads = [f"residual_{x}" for x in labels] + [f"sigma_{x}" for x in labels]
-                file = folder / f"innovations_{name}.csv"
-                write_csv(file, [*heads, "nis"], record.time_ns, table, 9)
+                write_csv(folder / f"innovations_{name}.csv", *_innovation_table(labels, record), 9)
             parameters.save(folder, self.model, self.params, {"run": self.run})
-            head = {"schema_version": SCHEMA_VERSION}
-            text = json.dumps(head | self.summary() | {"provenance": self.provenance}, indent=2)
+            document = {"schema_version": SCHEMA_VERSION, **self.summary()}
+            document |= {
+                "estimate_columns": [{"name": "time", "unit": "s", "frame": ""}, *columns],
+                "innovation_units": {
+                    name: list(manifold.error_units(self.model.sensor(name).space))
+                    for name in self.sensors
+                },
+                "provenance": self.provenance,
+            }
+            text = json.dumps(document, indent=2, allow_nan=False)
             (folder / "result.json").write_text(text + "\n", "utf-8")
         return Path(path)
 
-    def _table(self) -> tuple[list[str], Floats]:
-        columns = list(manifold.component_labels(self.model.space))
+    def _table(self) -> tuple[list[dict[str, str]], Floats]:
+        """Columns of `estimate.csv`, with unit and frame, and their values."""
+        columns: list[dict[str, str]] = []
         blocks = [np.asarray(leaf) for leaf in jax.tree.leaves(self.state)]
-        columns += [f"sigma_{label}" for label in self.error_labels]
         blocks.append(np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2)))
+        described = [("", self.model.space, "body")]
         parts = {part.name for part in manifold.parts(self.model.space)}
         for name, output in self.outputs.items():
-            space = self.model.output(name).space
             if name in parts or (name == "attitude" and "q_ref_body" in parts):
                 continue
-            columns += [f"{name}_{label}" for label in manifold.component_labels(space)]
-            columns += [f"sigma_{name}_{label}" for label in manifold.error_labels(space)]
+            described.append((name, self.model.output(name).space, output.frame))
             blocks += [output.value, output.sigma]
+        for name, space, frame in described:
+            columns += _describe(name, space, frame)
         return columns, np.concatenate(blocks, axis=1)
 
     def _save_covariance(self, path: Path) -> None:
         arrays: Mapping[str, Any] = {f"cov_{name}": out.cov for name, out in self.outputs.items()}
+        about: Mapping[str, Any] = {
+            f"unit_{name}": np.array([f"({out.unit})^2", f"frame: {out.frame}"])
+            for name, out in self.outputs.items()
+        }
         np.savez_compressed(
             path,
             schema_version=SCHEMA_VERSION,
@@ -175,4 +186,33 @@ class Estimate:
             labels=np.array(self.error_labels),
             units=np.array(manifold.error_units(self.model.space)),
             **arrays,
+            **about,
         )
+
+
+def _describe(name: str, space: Any, frame: str) -> list[dict[str, str]]:
+    """Name, unit and frame of the columns of a state or output: its numbers, then their sigmas."""
+    head = f"{name}_" if name else ""
+    columns = []
+    for part in manifold.parts(space):
+        for label in part.manifold.component_labels:
+            whole = "_".join(filter(None, (part.name, label)))
+            quaternion = part.manifold.shape != (part.manifold.dim,)
+            unit, seen = ("1", "body to reference") if quaternion else (part.manifold.unit, frame)
+            columns.append({"name": f"{head}{whole}", "unit": unit, "frame": seen})
+    for label, unit in zip(manifold.error_labels(space), manifold.error_units(space), strict=True):
+        columns.append({"name": f"sigma_{head}{label}", "unit": unit, "frame": frame})
+    return columns
+
+
+def _innovation_table(
+    labels: tuple[str, ...], record: SensorRecord
+) -> tuple[list[str], Times, Floats]:
+    """Columns, times and values of an innovation file; what was not used is blank."""
+    rows = np.arange(record.residual.shape[1])
+    sigma = np.sqrt(record.cov[:, rows, rows])
+    hidden = np.where(record.used, 0.0, np.nan)
+    heads = ["residual", "sigma", "used", "gated"]
+    columns = [f"{head}_{label}" if label else head for head in heads for label in labels]
+    values = [record.residual + hidden, sigma + hidden, record.used, record.gated, record.nis]
+    return [*columns, "nis"], record.time_ns, np.column_stack(values).astype(float)

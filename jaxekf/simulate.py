@@ -112,10 +112,10 @@ def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> M
     return Motion(amplitude=amplitude, frequency=frequency, phase=phase, rest_s=rest_s)
 
 
-def sample_times(hertz: float, duration_s: float, start_ns: int, phase_s: float = 0.0) -> Times:
+def sample_times(hertz: float, duration_s: float, start_ns: int) -> Times:
     """Regular sampling instants over the run."""
-    count = int(np.floor((duration_s - phase_s) * hertz + 1e-9)) + 1
-    return start_ns + np.round((phase_s + np.arange(count) / hertz) * NANOSECONDS).astype(np.int64)
+    count = int(np.floor(duration_s * hertz + 1e-9)) + 1
+    return start_ns + np.round(np.arange(count) / hertz * NANOSECONDS).astype(np.int64)
 
 
 def recording(

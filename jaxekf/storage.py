@@ -38,6 +38,12 @@ from jaxekf.recording import (
 )
 
 SCHEMA_VERSION = 1
+_BODY_TO_REFERENCE = "w,x,y,z, body to reference"
+_DESCRIBED = {
+    "optical": {"kind": "pose", "quaternion": _BODY_TO_REFERENCE, "unit": "1, m"},
+    "imu": {"kind": "imu", "frame": "body", "unit": "rad/s, m/s^2"},
+    "encoder": {"quaternion": _BODY_TO_REFERENCE},
+}
 _QUATERNION = ("qw", "qx", "qy", "qz")
 
 
@@ -54,6 +60,8 @@ def load(path: Path | str) -> Recording:
     """Read a recorded run. Raises `RecordingError`, which names file, line and column."""
     folder = Path(path)
     about = _read_description(folder)
+    for label, known in _DESCRIBED.items():
+        _check_description(folder, label, about.get(label, {}), known)
     read: dict[str, Any] = {}
     readers: dict[str, Callable[[Table, Mapping[str, Any]], Any]] = {
         "optical": _optical,
@@ -72,6 +80,24 @@ def load(path: Path | str) -> Recording:
     info |= {f"{key}_about": dict(about[key]) for key in readers if key in about}
     name = str(about.get("name", folder.resolve().name))
     return Recording(name, **read, info=info, path=folder)
+
+
+def _check_description(folder: Path, label: str, section: Any, known: Mapping[str, str]) -> None:
+    """What recording.toml says of a stream is what this version reads: nothing is taken for another."""
+    file = folder / "recording.toml"
+    if not isinstance(section, dict):
+        raise RecordingError(
+            file, f"{label} = {section!r}", "a section", f"[{label}]", column=label
+        )
+    for key, expected in known.items():
+        if key in section and section[key] != expected:
+            raise RecordingError(
+                file,
+                f"{label}.{key} = {section[key]!r}",
+                f"'{expected}'",
+                "converting the file",
+                column=f"{label}.{key}",
+            )
 
 
 def _read_description(folder: Path) -> Mapping[str, Any]:
@@ -239,7 +265,9 @@ def _optical(table: Table, about: Mapping[str, Any]) -> Optical:
         position = _numbers(table, ("x", "y", "z"), blank=True)
     if "status" in table.columns:
         at = table.columns.index("status")
-        good = {str(word).lower() for word in about.get("status_ok", ["ok", "0"])}
+        words = about.get("status_ok", ["ok", "0"])
+        words = words if isinstance(words, list) else [words]
+        good = {str(word).strip().lower() for word in words}
         valid &= np.array([row[at].strip().lower() in good for row in table.rows])
     return Optical(_times(table), q, valid, position)
 
@@ -274,8 +302,26 @@ def _encoder(table: Table, about: Mapping[str, Any]) -> Encoder:
         valid = np.ones(len(q), bool)
     else:
         q, valid = unit_quaternions(_numbers(table, _QUATERNION, blank=True))
-    frame = to_scipy(np.asarray(about.get("q_optical_encoder", [1.0, 0.0, 0.0, 0.0]), float))
+    frame = _fixed_rotation(about, "q_optical_encoder", table.path)
     return Encoder(_times(table), from_scipy(frame * to_scipy(q)), valid, scored & valid)
+
+
+def _vector(value: Any, size: int, place: Path | str, name: str) -> Floats:
+    """A direction or quaternion from recording.toml, of unit length."""
+    try:
+        vector = np.asarray(value, float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    length = np.linalg.norm(vector)
+    if vector.shape != (size,) or not np.isfinite(length) or length < 1e-9:
+        raise RecordingError(
+            place, f"{name} = {value!r}", f"{size} numbers, not all 0", "correcting recording.toml"
+        )
+    return vector / length
+
+
+def _fixed_rotation(about: Mapping[str, Any], key: str, place: Path | str) -> Rotation:
+    return to_scipy(_vector(about.get(key, [1.0, 0.0, 0.0, 0.0]), 4, place, f"encoder.{key}"))
 
 
 def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -> Floats:
@@ -284,10 +330,9 @@ def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -
         raise RecordingError(
             place, "a joint angle without an axis", "axis = [x, y, z]", "adding it under [encoder]"
         )
-    axis = np.asarray(about["axis"], float)
-    axis = axis / np.linalg.norm(axis)
+    axis = _vector(about["axis"], 3, place, "encoder.axis")
     turn = Rotation.from_rotvec(angle[:, None] * axis)
-    zero = to_scipy(np.asarray(about.get("q_zero", [1.0, 0.0, 0.0, 0.0]), float))
+    zero = _fixed_rotation(about, "q_zero", place)
     side = about.get("acts_on", "reference")
     if side not in ("reference", "body"):
         raise RecordingError(
@@ -300,14 +345,29 @@ def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -
 # Writing
 
 
-@contextmanager
-def whole_folder(path: Path | str, *, overwrite: bool = False) -> Any:
-    """A temporary folder beside `path` that becomes it when the block ends well, and is gone if not."""
+def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> None:
+    """Raise `RecordingError` where an output folder may not be written: see `whole_folder`."""
     target = Path(path)
-    if target.exists() and not overwrite:
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if not (target / marker).is_file():
+        raise RecordingError(
+            target, f"a path that exists and holds no {marker}", "a new one", "another output"
+        )
+    if not overwrite:
         raise RecordingError(
             target, "a path that exists", "a new one", "another output or the overwrite option"
         )
+
+
+@contextmanager
+def whole_folder(path: Path | str, marker: str, *, overwrite: bool = False) -> Any:
+    """A temporary folder beside `path` that becomes it when the block ends well, and is gone if not.
+
+    With `overwrite` it replaces an older folder of the same kind: one that holds the file `marker`.
+    """
+    check_output(path, marker, overwrite=overwrite)
+    target = Path(path).resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     try:
@@ -315,8 +375,6 @@ def whole_folder(path: Path | str, *, overwrite: bool = False) -> Any:
         temporary.chmod(0o755)
         if target.is_dir():
             shutil.rmtree(target)
-        elif target.exists():
-            target.unlink()
         temporary.rename(target)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -364,7 +422,7 @@ def save(
     about |= {
         k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about
     }
-    with whole_folder(path, overwrite=overwrite) as folder:
+    with whole_folder(path, "recording.toml", overwrite=overwrite) as folder:
         for label in ("optical", "imu", "encoder"):
             stream = getattr(recording, label)
             if stream is None:
@@ -384,7 +442,7 @@ def _optical_columns(stream: Optical, about: dict[str, Any]) -> Any:
         columns += ["x", "y", "z"]
         values.append(np.where(hidden, np.nan, stream.position))
     about.pop("status_ok", None)
-    about |= {"kind": "pose", "quaternion": "w,x,y,z, body to reference", "unit": "1, m"}
+    about |= _DESCRIBED["optical"]
     return columns, np.concatenate(values, axis=1), about
 
 
@@ -396,15 +454,15 @@ def _imu_columns(stream: Imu, about: dict[str, Any]) -> Any:
     if stream.magnetometer is not None:
         columns += ["mx", "my", "mz"]
         values.append(stream.magnetometer)
-    about |= {"kind": "imu", "frame": "body", "unit": "rad/s, m/s^2"}
+    about |= _DESCRIBED["imu"]
     return columns, np.concatenate(values, axis=1), about
 
 
 def _encoder_columns(stream: Encoder, about: dict[str, Any]) -> Any:
     """A joint angle again where the description is of a joint, else quaternions."""
     if "axis" in about:
-        frame = to_scipy(np.asarray(about.get("q_optical_encoder", [1.0, 0.0, 0.0, 0.0]), float))
-        zero = to_scipy(np.asarray(about.get("q_zero", [1.0, 0.0, 0.0, 0.0]), float))
+        frame = _fixed_rotation(about, "q_optical_encoder", "recording")
+        zero = _fixed_rotation(about, "q_zero", "recording")
         q = frame.inv() * to_scipy(stream.q_ref_body)
         on_reference = about.get("acts_on", "reference") == "reference"
         turn = q * zero.inv() if on_reference else zero.inv() * q
@@ -415,7 +473,7 @@ def _encoder_columns(stream: Encoder, about: dict[str, Any]) -> Any:
     else:
         columns = list(_QUATERNION)
         values = np.where(~stream.valid[:, None], np.nan, stream.q_ref_body)
-        about |= {"kind": "attitude", "quaternion": "w,x,y,z, body to reference", "unit": "1"}
+        about |= {"kind": "attitude", "unit": "1"} | _DESCRIBED["encoder"]
         about.pop("q_optical_encoder", None)
     if not stream.scored.all():
         columns, values = [*columns, "scored"], np.c_[values, stream.scored.astype(float)]

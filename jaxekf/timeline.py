@@ -20,17 +20,21 @@ from jaxekf.recording import NANOSECONDS, Recording, Samples, Times, period_ns
 
 _UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
 _LONGEST_EPOCH = 32
+LONGEST_INPUT_GAP_S = 0.1
+"""An input is interpolated over shorter gaps; over longer ones the motion is not known."""
 
 
 class Rows(NamedTuple):
     """Samples of one sensor, one for each (sub)step; leading axes are the steps'."""
 
     value: Any
+    """What is hidden may be anything, NaN included."""
     aux: Any
+    """Finite, also where the sample is hidden: it passes through the model's own functions."""
     mask: Any
     """(..., rows) True where a row is visible."""
     dt: Any
-    """Seconds since the sensor's previous sample."""
+    """Sampling period in seconds: the time since the sensor's previous sample, nominal after a gap."""
 
 
 class Knots(NamedTuple):
@@ -88,9 +92,13 @@ def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = Non
     model must start with is never seen.
     """
     samples = {s.name: _read(s, recording) for s in model.sensors}
-    driver = model.input.source(recording) if model.input else None
+    driver = None
+    if model.input is not None:
+        driver = _check_input(model.input.source(recording), recording, model.input.name)
     start, end = _span(model, recording, samples, driver)
     account = {name: _count(stream, start, end) for name, stream in samples.items()}
+    if driver is not None and model.input is not None:
+        account[model.input.name] = _count(driver, start, end)
     samples = {name: _cut(stream, start, end) for name, stream in samples.items()}
     if model.hold_to is not None:
         samples = _hold(samples, model.hold_to, account)
@@ -134,11 +142,55 @@ def _read(sensor: Sensor, recording: Recording) -> Samples:
     mask = np.asarray(samples.mask)
     if mask.ndim == 1:
         mask = np.repeat(mask[:, None], sensor.rows, axis=1)
-    return Samples(samples.time_ns, samples.value, mask, samples.aux)
+    aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)
+    return Samples(samples.time_ns, samples.value, mask, aux)
+
+
+def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
+    """Auxiliary data, what is not finite in hidden samples replaced by a known value.
+
+    It passes through the model's own functions, whose gradient a NaN would reach even where the row
+    is masked.
+    """
+    values = np.array(values)
+    known = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    visible = mask.any(axis=1)
+    bad = np.flatnonzero(visible & ~known)
+    if bad.size:
+        raise RecordingError(
+            recording.path or recording.name,
+            f"auxiliary data of {name} that is not finite at sample {int(bad[0])}",
+            "finite data for every visible sample",
+            "masking the sample",
+        )
+    values[~known] = values[np.argmax(known)] if known.any() else 1.0
+    return values
+
+
+def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
+    """The input's valid samples; an input cannot be masked, so that a long gap in it is an error."""
+    driver = _take(driver, np.asarray(driver.mask))
+    place = recording.path or recording.name
+    count = len(driver.time_ns)
+    if count < 2:
+        raise RecordingError(
+            place, f"{count} samples of {name}", "at least two", "a longer recording"
+        )
+    steps = np.diff(driver.time_ns)
+    longest = int(np.argmax(steps))
+    if steps[longest] > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * period_ns(driver.time_ns)):
+        begin = driver.time_ns[longest] / NANOSECONDS
+        raise RecordingError(
+            place,
+            f"a gap of {steps[longest] / NANOSECONDS:.3f} s in {name} at {begin:.6f} s",
+            f"none longer than {LONGEST_INPUT_GAP_S} s",
+            "cutting the run there, or a model that measures it (loose_rate)",
+        )
+    return driver
 
 
 def _visible(samples: Samples) -> NDArray[np.bool_]:
-    return np.asarray(samples.mask.any(axis=1))
+    return np.asarray(samples.mask.reshape(len(samples.mask), -1).any(axis=1))
 
 
 def _first_visible(samples: Samples) -> Any:
@@ -241,8 +293,11 @@ def _hold(
             continue
         last = np.searchsorted(stream.time_ns, grid, side="right") - 1
         taken = _take(stream, np.maximum(last, 0))
-        held[name] = Samples(grid, taken.value, taken.mask & (last >= 0)[:, None], taken.aux)
-        used = int(_visible(held[name]).sum())
+        # A stream that has stopped is not held for ever, but for a period and a half of the slower.
+        oldest = 1.5 * max(period_ns(grid), period_ns(stream.time_ns))
+        fresh = (last >= 0) & (grid - taken.time_ns <= oldest)
+        held[name] = Samples(grid, taken.value, taken.mask & fresh[:, None], taken.aux)
+        used = len(np.unique(last[_visible(held[name])]))
         account[name]["dropped_by_holding"] = account[name]["fed"] - used
         account[name]["fed"] = used
     return held
@@ -312,7 +367,9 @@ def _rows(samples: Samples, asked: Times) -> Rows:
     at = np.clip(np.searchsorted(samples.time_ns, asked), 0, len(samples.time_ns) - 1)
     here = samples.time_ns[at] == asked
     nominal = period_ns(samples.time_ns)
-    since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal) / NANOSECONDS
+    since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal)
+    # After a dropout a sample has not averaged over the gap: its own period is the nominal one.
+    since = np.minimum(since, nominal) / NANOSECONDS
     taken = _take(samples, at)
     return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
 

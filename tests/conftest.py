@@ -18,7 +18,7 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of recorded data: ``$JAXEKF_DATA``, or ``../shared/data`` beside the repository."""
+    """The folder of recorded data: ``$JAXEKF_DATA``, or ``../shared/data`` by the repository."""
     folder = Path(os.environ.get("JAXEKF_DATA", REPOSITORY / ".." / "shared" / "data"))
     if not folder.is_dir():
         pytest.skip(

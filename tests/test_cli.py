@@ -169,3 +169,67 @@ def test_the_installed_command_switches_to_float64(tmp_path):
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["runs"][0]["run"] == "constant-rate"
     assert "━" not in done.stderr
+
+
+def test_a_result_never_replaces_its_recording(runs, tmp_path):
+    """Would catch --overwrite that deletes the user's data."""
+    folder = runs[0].parent
+    before = sorted(p.name for p in runs[0].iterdir())
+    result = call("estimate", runs[0], "-o", folder, "--overwrite")
+    assert result.exit_code == 1
+    assert sorted(p.name for p in runs[0].iterdir()) == before
+
+
+def test_a_model_without_bias_and_rate(runs, tmp_path, monkeypatch):
+    """Would catch a command line that knows the loose models only."""
+    (tmp_path / "attitude_only.py").write_text(
+        "from dataclasses import replace\n"
+        "from jaxekf.models.loose import MODEL as LOOSE\n"
+        "MODEL = replace(LOOSE, name='attitude_only', outputs=LOOSE.outputs[:1])\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    own = ["--model", "attitude_only:MODEL"]
+    for arguments in (
+        ["estimate", runs[0], "-o", "out"],
+        ["tune", runs[0], "--iterations", 1, "-o", "tuned"],
+        ["plot", runs[0], "-o", "figures"],
+    ):
+        result = call(*arguments, *own)
+        assert result.exit_code == 0, result.output
+    assert not list((tmp_path / "figures").glob("*rate*"))
+
+
+def test_what_a_table_would_hide_is_said(runs, tmp_path):
+    """Would catch dropped rows and hopeless noise passing without a word."""
+    record = jaxekf.load(runs[0])
+    imu = record.need_imu()
+    half = len(imu.time_ns) // 2
+    jaxekf.save(
+        record.replace(imu=type(imu)(imu.time_ns[:half], imu.gyroscope[:half])), tmp_path / "run"
+    )
+    noise = tmp_path / "noise.toml"
+    noise.write_text(
+        'schema_version = 1\nmodel = "loose"\n[noise.optical]\nvalue = 1e-4\nunit = "rad"\n'
+    )
+    result = call("estimate", tmp_path / "run", "--noise", noise, "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "outside the run" in result.output
+    assert "times larger" in result.output
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--seed", "-1"],
+        ["--duration", "inf"],
+        ["--optical-noise", "nan"],
+        ["--gyroscope-noise", "-1"],
+        ["--occlusion", "3,2"],
+    ],
+)
+def test_simulate_refuses_nonsense(arguments, tmp_path):
+    """Would catch a run that cannot be, or a traceback."""
+    result = call("simulate", *arguments, "-o", tmp_path / "runs")
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+    assert not (tmp_path / "runs").exists()

@@ -124,7 +124,7 @@ def test_float32_is_refused_in_a_sentence():
 def test_broken_recursion_names_run_step_and_sensor():
     """Would catch NaN in a result, or an error that does not say where."""
     params = as_arrays(jaxekf.get_model("loose").parameters)
-    zero = params._replace(noise=params.noise._replace(optical=np.float64(np.nan)))
+    zero = params._replace(noise=params.noise._replace(optical=np.float64(1e-200)))
     with pytest.raises(FilterError) as caught:
         jaxekf.estimate(record(), "loose", zero)
     for word in ("run-1", "step", " s,", "optical", "expected"):

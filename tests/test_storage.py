@@ -118,6 +118,14 @@ CASES = {
     "header only": (lambda f: (f / "imu.csv").write_text("time,gx,gy,gz\n"), "0 samples", None),
     "no axis": (lambda f: edit(f / "recording.toml", "axis =", "axes ="), "axis = [x, y, z]", None),
     "not TOML": (lambda f: (f / "recording.toml").write_text("a = = 1"), "not TOML", None),
+    "axis of nothing": (lambda f: edit(f / "recording.toml", "1.0,", "0.0,"), "encoder.axis", None),
+    "other unit": (lambda f: edit(f / "recording.toml", "rad/s, m/s^2", "deg/s"), "deg/s", None),
+    "other order": (lambda f: edit(f / "recording.toml", "w,x,y,z,", "x,y,z,w,"), "x,y,z,w", None),
+    "name of a path": (
+        lambda f: edit(f / "recording.toml", 'name = "run"', 'name = "../x"'),
+        "../x",
+        None,
+    ),
     "later version": (
         lambda f: edit(f / "recording.toml", "version = 1", "version = 9"),
         "9",
@@ -208,7 +216,7 @@ def test_recordings_in_memory_are_checked(make):
 def test_output_is_whole_or_not_there(tmp_path):
     """Would catch a half-written folder, or an old result lost to a failed new one."""
     target = tmp_path / "out"
-    with pytest.raises(ZeroDivisionError), storage.whole_folder(target) as folder:
+    with pytest.raises(ZeroDivisionError), storage.whole_folder(target, "recording.toml") as folder:
         (folder / "a").write_text("half")
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
@@ -216,7 +224,10 @@ def test_output_is_whole_or_not_there(tmp_path):
     with pytest.raises(RecordingError, match="exists"):
         storage.save(constant(), target)
     before = sorted(p.name for p in target.iterdir())
-    with pytest.raises(ZeroDivisionError), storage.whole_folder(target, overwrite=True):
+    with (
+        pytest.raises(ZeroDivisionError),
+        storage.whole_folder(target, "recording.toml", overwrite=True),
+    ):
         raise ZeroDivisionError
     assert sorted(p.name for p in target.iterdir()) == before
 
@@ -231,3 +242,103 @@ def test_encoder_interpolation_invents_nothing():
     at = encoder_at(encoder, np.array([-5, 0, 5, 20, 200, 405, 500], np.int64) * 1_000_000)
     assert at.valid.tolist() == [False, True, True, False, False, True, False]
     assert at.scored.tolist() == [False, True, True, False, False, True, False]
+
+
+def test_overwriting_replaces_only_its_own_kind(tmp_path):
+    """Would catch a result that replaces the recording it came from."""
+    target = storage.save(constant(), tmp_path / "run")
+    with pytest.raises(RecordingError, match=r"holds no result.json"):
+        storage.check_output(target, "result.json", overwrite=True)
+    (tmp_path / "empty").mkdir()
+    storage.check_output(tmp_path / "empty", "result.json")
+    (tmp_path / "link").symlink_to(target)
+    storage.save(constant(2), tmp_path / "link", overwrite=True)
+    assert (tmp_path / "link").is_symlink()
+    assert jaxekf.load(target).info["seed"] == 2
+
+
+def test_one_word_for_a_good_status(folder):
+    """Would catch a string that is read letter by letter."""
+    file = folder / "optical.csv"
+    lines = file.read_text().splitlines()
+    status = ["ok" if i % 2 else "o" for i in range(len(lines))]
+    status[0] = "status"
+    file.write_text("\n".join(f"{a},{b}" for a, b in zip(lines, status, strict=True)))
+    edit(folder / "recording.toml", "[optical]", '[optical]\nstatus_ok = "ok"')
+    valid = jaxekf.load(folder).need_optical().valid
+    assert valid[0]
+    assert not valid[1::2].any()
+
+
+def without(stream, hidden):
+    """A stream with some rows taken away."""
+    return type(stream)(**{k: None if v is None else v[~hidden] for k, v in vars(stream).items()})
+
+
+def test_a_gap_in_the_input_is_not_bridged():
+    """Would catch motion made up while nothing was measured: attitude wrong by degrees, unnoticed."""
+    record = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=6.0)
+    t = (record.imu.time_ns - record.imu.time_ns[0]) / 1e9
+    gap = record.replace(imu=without(record.imu, (t > 3.0) & (t < 3.5)))
+    with pytest.raises(RecordingError, match=r"gap of 0\.5.* s in gyroscope"):
+        jaxekf.estimate(gap)
+    assert jaxekf.score(jaxekf.estimate(gap, "loose_rate"), gap).attitude_rmse_deg < 1.0
+    short = record.replace(imu=without(record.imu, (t > 3.0) & (t < 3.05)))
+    assert jaxekf.score(jaxekf.estimate(short), short).attitude_rmse_deg < 0.3
+    one = record.replace(imu=without(record.imu, t > 0.0))
+    with pytest.raises(RecordingError, match="1 samples of gyroscope"):
+        jaxekf.estimate(one)
+
+
+def test_rate_truth_is_not_made_up_over_gaps():
+    """Would catch a rate by differences over a hole in the encoder."""
+    from jaxekf.recording import encoder_rate_at
+
+    record = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=6.0)
+    encoder = record.need_encoder()
+    t = (encoder.time_ns - encoder.time_ns[0]) / 1e9
+    known = encoder_rate_at(encoder, encoder.time_ns)
+    holed = encoder_rate_at(without(encoder, (t > 3.0) & (t < 4.0)), encoder.time_ns)
+    assert np.isnan(holed[(t > 3.0) & (t < 4.0)]).all()
+    told = np.isfinite(holed).all(axis=1)
+    np.testing.assert_allclose(holed[told], known[told], atol=1e-9)
+    assert told.mean() > 0.8
+
+
+def test_held_samples_go_stale(tmp_path):
+    """Would catch a gyroscope that has stopped being held for the rest of the run."""
+    record = simulate.recording(
+        "run", simulate.constant_rate_motion(rest_s=0.5), seed=1, duration_s=4.0
+    )
+    t = (record.imu.time_ns - record.imu.time_ns[0]) / 1e9
+    made = jaxekf.estimate(record.replace(imu=without(record.imu, t > 2.0)), "loose_additive")
+    account = made.account["gyroscope"]
+    assert account["used"] == 126
+    assert account["dropped_by_holding"] == 125
+    used = made.sensors["gyroscope"].used.any(axis=1)
+    assert used.sum() <= 128
+
+
+def test_aux_of_hidden_samples_is_made_finite():
+    """Would catch a NaN beside a hidden sample that reaches the gradient of the noise."""
+    from dataclasses import replace
+
+    from jaxekf import get_model, timeline
+    from jaxekf.recording import Samples
+
+    loose = get_model("loose")
+    source = loose.sensors[0].source
+
+    def with_quality(visible):
+        def read(record):
+            samples = source(record)
+            quality = np.where(visible & samples.mask, 2.0, np.nan)
+            return Samples(samples.time_ns, samples.value, samples.mask, quality)
+
+        return replace(loose, sensors=(replace(loose.sensors[0], source=read),))
+
+    rows = timeline.build(with_quality(True), constant()).steps.slow["optical"]
+    assert not rows.mask.all()
+    np.testing.assert_array_equal(rows.aux, 2.0)
+    with pytest.raises(RecordingError, match="auxiliary data of optical"):
+        timeline.build(with_quality(False), constant())

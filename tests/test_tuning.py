@@ -186,6 +186,16 @@ def test_any_free_vector_is_a_positive_definite_covariance(values):
         (lambda runs: tuning.tune([runs[0].replace(encoder=None)]), "no scored encoder"),
         (lambda runs: objectives.parse("attitude+2*speed"), "2*speed"),
         (lambda runs: tuning.tune(runs, iterations=0), "0 iterations"),
+        (lambda runs: tuning.tune(runs, free=[]), "nothing that is free"),
+        (lambda runs: tuning.tune(runs, validate=runs[:1]), "run-0"),
+        (lambda runs: tuning.tune(runs, objective="-1*attitude"), "negative weight"),
+        (lambda runs: tuning.tune(runs, burn_in_s=100.0), "burn-in"),
+        (
+            lambda runs: tuning.tune(
+                [runs[0].replace(encoder=None)], objective="likelihood", rescale=True, iterations=1
+            ),
+            "no scored encoder",
+        ),
     ],
 )
 def test_ill_posed_problems_are_refused_in_a_sentence(short, call, words):
@@ -213,3 +223,62 @@ def test_walk_stops_when_it_has_converged():
     else:
         pytest.fail("no stop")
     np.testing.assert_allclose(walk.stand, 0.0, atol=1e-2)
+
+
+def test_what_is_not_free_is_not_touched(short):
+    """Would catch frozen noise that is reshaped or averaged on the way."""
+    base = start_at(1.0)
+    each = jnp.asarray([1e-3, 2e-3, 4e-3])
+    base = base._replace(noise=base.noise._replace(gyroscope=each))
+    tuned = tuning.tune(
+        short[:1], start=base, free=["noise.optical"], axes="full", iterations=2, rescale=False
+    )
+    np.testing.assert_array_equal(tuned.params.noise.gyroscope, each)
+    assert tuned.params.noise.optical.shape == (3, 3)
+    kept = tuning.tune(short[:1], start=base, iterations=2, rescale=False)
+    assert kept.params.noise.gyroscope.shape == (3,)
+
+
+def test_an_interrupted_tuning_keeps_the_best(short):
+    """Would catch work lost to Ctrl-C."""
+
+    def stop(step, total):
+        if step.number == 3:
+            raise KeyboardInterrupt
+
+    tuned = tuning.tune(short[:1], iterations=20, progress=stop)
+    assert "interrupted" in tuned.stopped
+    assert tuned.best.training == min(step.training for step in tuned.history[:3])
+
+
+def test_calibration_of_another_model_does_not_stay(tmp_path):
+    """Would catch an old calibration.toml beside new noise."""
+    for name in ("loose", "loose_rate"):
+        model = jaxekf.get_model(name)
+        jaxekf.save_parameters(tmp_path, model, model.parameters, {})
+        jaxekf.load_parameters(model, tmp_path)
+    assert not (tmp_path / "calibration.toml").exists()
+
+
+NOISE_FILES = {
+    "other unit": ('unit = "rad"', 'unit = "deg"', "converting"),
+    "not positive": ("value = 0.00523", "value = -0.00523", "positive"),
+    "not a number": ("value = 0.005235987755982988", 'value = "a"', "finite numbers"),
+    "wrong shape": ("value = 0.005235987755982988", "value = [0.1, 0.2]", "finite numbers"),
+    "unknown leaf": ("[noise.optical]", "[noise.optcal]", "optcal"),
+    "unknown section": ("[noise.optical]", "[nois.optical]", "nois"),
+    "other model": ('model = "loose"', 'model = "loose_rate"', "loose_rate"),
+}
+
+
+@pytest.mark.parametrize("case", NOISE_FILES)
+def test_faulty_noise_files_are_refused(tmp_path, case):
+    """Would catch a noise file that is read as something else, or half."""
+    model = jaxekf.get_model("loose")
+    jaxekf.save_parameters(tmp_path, model, model.parameters, {})
+    old, new, words = NOISE_FILES[case]
+    text = (tmp_path / "noise.toml").read_text()
+    assert old in text
+    (tmp_path / "noise.toml").write_text(text.replace(old, new))
+    with pytest.raises(jaxekf.JaxekfError, match=words):
+        jaxekf.load_parameters(model, tmp_path)

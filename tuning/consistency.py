@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf.errors import TuningError
 from jaxekf.estimation import evaluate_outputs
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
@@ -33,4 +34,15 @@ def scale(model: Model, params: Parameters, data: Data) -> float:
 
     Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set).
     """
-    return float(_mean_nees(model, params, data))
+    if "attitude" not in data.truth or not bool(jnp.any(data.truth["attitude"].judged)):
+        raise TuningError(
+            "got no scored encoder sample, expected some to compare covariances with; tune by"
+            " likelihood without rescaling"
+        )
+    factor = float(_mean_nees(model, params, data))
+    if not 0.0 < factor < float("inf"):
+        raise TuningError(
+            f"got a mean normalised error of {factor}, expected a positive one; look for exact data"
+            " or a noise that is far off"
+        )
+    return factor

@@ -62,6 +62,10 @@ def prepare(
             if name in truth:
                 truth[name].value[place] = value
                 truth[name].judged[place] = known & settled
+    if not counted.any():
+        raise TuningError(
+            f"got no instant after a burn-in of {burn_in_s} s, expected some; ask for a shorter one"
+        )
     if need_truth and not any(t.judged.any() for t in truth.values()):
         raise TuningError(
             f"got no scored encoder sample in {[r.name for r in recordings]}, expected some to"

@@ -18,11 +18,12 @@ from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, provenance, require_float64
 from jaxekf.model import Model, Parameters
 from jaxekf.models import get_model
+from jaxekf.parameters import as_arrays
 from jaxekf.recording import Recording
 from tuning import consistency
 from tuning.data import Data, prepare
 from tuning.noise import Layout, layout, scaled, with_axes
-from tuning.objectives import Objective, attitude_error, evaluate
+from tuning.objectives import Objective, attitude_error, evaluate, parse
 
 _MOST_REJECTIONS = 10
 _IMPROVEMENT = 1e-4
@@ -94,10 +95,10 @@ def tune(
     *,
     validate: Sequence[Run] = (),
     model: str | Model = "loose",
-    objective: Objective | None = None,
+    objective: Objective | str | None = None,
     free: Sequence[str] | None = None,
     start: Parameters | None = None,
-    axes: str = "tied",
+    axes: str | None = None,
     iterations: int = 60,
     patience: int = 15,
     burn_in_s: float = 0.0,
@@ -108,7 +109,8 @@ def tune(
     """Tune noise, and calibration where asked, by gradient over all runs in one compiled call.
 
     `objective` is the attitude error unless given. `free` names what may change (default: all noise);
-    `axes` gives one deviation for all axes (`tied`), one for each, or a `full` matrix. L-BFGS is
+    `axes` gives what is free one deviation for all axes (`tied`), one for `each`, or a `full` matrix;
+    None leaves it as the start has it. L-BFGS is
     the optimiser unless an optax one is given. The best parameters so far are kept, by the validation
     runs where there are any; the tuner stops when they have not improved for `patience` iterations.
     Steps that are not finite are rejected, shortened and counted.
@@ -121,9 +123,12 @@ def tune(
     """
     require_float64()
     chosen = get_model(model)
-    aim = objective or attitude_error()
-    base = with_axes(chosen, chosen.parameters if start is None else start, axes)
+    aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
+    base = as_arrays(chosen.parameters if start is None else start)
+    if axes is not None:
+        base = with_axes(chosen, base, axes, free)
     where = layout(chosen, base, free)
+    _check_runs(runs, validate)
     need_truth = bool(aim.errors)
     training = prepare(chosen, runs, burn_in_s=burn_in_s, need_truth=need_truth)
     held_out = None
@@ -133,7 +138,7 @@ def tune(
     best_free, best, history, stopped = search.run(optimiser, iterations, patience, progress)
     params = where.from_free(best_free, base)
     scale = 1.0
-    if rescale if rescale is not None else not aim.likelihood:
+    if rescale if rescale is not None else not aim.likelihood and "attitude" in training.truth:
         scale = consistency.scale(chosen, params, training)
         params = scaled(params, scale)
     origin = {
@@ -153,6 +158,16 @@ def tune(
     return Tuned(chosen, params, base, aim, best, tuple(history), stopped, scale, where, origin)
 
 
+def _check_runs(runs: Sequence[Run], validate: Sequence[Run]) -> None:
+    """A run that is learnt from cannot judge what was learnt."""
+    both = sorted({_name(run) for run in runs} & {_name(run) for run in validate})
+    if both:
+        raise TuningError(
+            f"got {both} among the training and the validation runs, expected different runs;"
+            " leave each in one of them"
+        )
+
+
 def _name(run: Run) -> str:
     return run.name if isinstance(run, Recording) else Path(run).name
 
@@ -167,6 +182,8 @@ class _Search:
     base: Parameters
     training: Data
     validation: Data | None
+    found: tuple[Array, Iteration, list[Iteration]] | None = None
+    """The best so far, for an interrupted search."""
 
     def value_and_gradient(self, free: Array) -> tuple[float, Array]:
         value, gradient = _value_and_gradient(
@@ -189,6 +206,20 @@ class _Search:
         progress: Progress | None,
     ) -> tuple[Array, Iteration, list[Iteration], str]:
         """Step until done; the best free vector, its iteration, the history and why it stopped."""
+        try:
+            return self._step(optimiser, iterations, patience, progress)
+        except KeyboardInterrupt:
+            if self.found is None:
+                raise
+            return *self.found, "interrupted; the best so far is kept"
+
+    def _step(
+        self,
+        optimiser: optax.GradientTransformation | None,
+        iterations: int,
+        patience: int,
+        progress: Progress | None,
+    ) -> tuple[Array, Iteration, list[Iteration], str]:
         walk = _Walk(self.layout.to_free(self.base), optimiser)
         best_free, best_judged, since = walk.candidate, float("inf"), 0
         best: Iteration | None = None
@@ -211,6 +242,7 @@ class _Search:
                 if best is None or judged < best_judged - _IMPROVEMENT * abs(best_judged):
                     since = number
                 best_free, best, best_judged = walk.candidate, step, judged
+                self.found = (best_free, best, history)
             if number - since >= patience:
                 return (
                     best_free,

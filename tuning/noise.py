@@ -106,6 +106,8 @@ def layout(model: Model, params: Parameters, free: Sequence[str] | None = None) 
     """
     values, units = _by_name(params), _by_name(model.units)
     wanted = ["noise"] if free is None else list(free)
+    if not wanted:
+        raise TuningError("got nothing that is free, expected some parameters; name noise, for one")
     chosen: list[str] = []
     for name in wanted:
         found = [n for n in values if n == name or n.startswith(f"{name}.")]
@@ -134,8 +136,13 @@ def _check_positive(name: str, value: Any) -> None:
         )
 
 
-def with_axes(model: Model, params: Parameters, axes: str) -> Parameters:
-    """The same noise with one deviation for all axes (`tied`), one for each, or a `full` factor."""
+def with_axes(
+    model: Model, params: Parameters, axes: str, free: Sequence[str] | None = None
+) -> Parameters:
+    """The same noise with one deviation for all axes (`tied`), one for `each`, or a `full` factor.
+
+    With `free` (see `layout`) only the leaves that it names are changed.
+    """
     if axes not in AXES:
         raise TuningError(f"got axes '{axes}', expected one of {AXES}; choose one")
 
@@ -148,8 +155,15 @@ def with_axes(model: Model, params: Parameters, axes: str) -> Parameters:
         each = np.sqrt(np.diagonal(cov))
         return each if axes == "each" else np.sqrt(np.mean(each**2))
 
-    noise = jax.tree.map(reshape, params.noise, model.noise_dims)
-    return as_arrays(params._replace(noise=noise))
+    chosen = {leaf.name for leaf in layout(model, params, free).leaves}
+    names = [f"noise.{name}" for name in leaf_names(params.noise)]
+    leaves, structure = jax.tree.flatten(params.noise)
+    dims = jax.tree.leaves(model.noise_dims)
+    changed = [
+        reshape(leaf, dim) if free is None or name in chosen else leaf
+        for name, leaf, dim in zip(names, leaves, dims, strict=True)
+    ]
+    return as_arrays(params._replace(noise=jax.tree.unflatten(structure, changed)))
 
 
 def scaled(params: Parameters, factor: float) -> Parameters:

@@ -27,6 +27,14 @@ class Objective:
     errors: tuple[tuple[str, float], ...] = ()
     likelihood: float = 0.0
 
+    def __post_init__(self) -> None:
+        weights = [weight for _, weight in self.errors] + [self.likelihood]
+        if not all(0.0 <= weight < float("inf") for weight in weights):
+            raise TuningError(
+                f"got the weights {weights}, expected numbers of at least 0; an objective is"
+                " minimised, so that a negative weight asks for the worst estimate"
+            )
+
     def __add__(self, other: "Objective") -> "Objective":
         return Objective(self.errors + other.errors, self.likelihood + other.likelihood)
 

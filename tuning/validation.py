@@ -45,9 +45,9 @@ def compare(
     nan = float("nan")
     for i, recording in enumerate(recordings):
         times = next(iter(estimates.values()))[i].time_ns
-        rows.append(
-            Row(recording.name, "hold last", score_hold_last(recording, times), nan, nan, nan)
-        )
+        if recording.optical is not None:
+            held = score_hold_last(recording, times)
+            rows.append(Row(recording.name, "hold last", held, nan, nan, nan))
         for name, made in estimates.items():
             judged = score(made[i], recording)
             rows.append(
@@ -56,11 +56,17 @@ def compare(
                     name,
                     judged.attitude_rmse_deg,
                     judged.rate_rmse_deg_s,
-                    made[i].mean_nis("optical"),
+                    _tracker_nis(made[i]),
                     judged.attitude_nees,
                 )
             )
     return Comparison(rows, estimates, recordings)
+
+
+def _tracker_nis(estimate: Estimate) -> float:
+    """Of the sensor called optical, or of all where the model has none."""
+    names = ["optical"] if "optical" in estimate.sensors else list(estimate.sensors)
+    return sum(estimate.mean_nis(name) for name in names) / len(names)
 
 
 def mean_by_variant(rows: Sequence[Row], field: str = "attitude_rmse_deg") -> dict[str, float]:

@@ -45,7 +45,7 @@ class Commands(click.Group):
             raise click.ClickException(str(error)) from error
         except OSError as error:
             raise click.ClickException(
-                f"{error.filename or 'output'}: got '{error.strerror}', expected to read or write"
+                f"{error.filename or 'output'}: got '{error.strerror or error}', expected to read or write"
                 " there; check the path and its permissions"
             ) from error
 

@@ -12,10 +12,9 @@ from jaxekf.cli.console import json_option, note, print_json, tuning_progress
 from jaxekf.cli.plot import FIGURES, draw
 from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo as runs
-from jaxekf.errors import RecordingError
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
-from jaxekf.storage import load, write_whole
+from jaxekf.storage import check_output, load, whole_folder
 from tuning.validation import as_dicts
 
 # What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
@@ -33,10 +32,7 @@ def demo(output: Path, as_json: bool) -> None:
 
     The recordings come from the package's own simulator. A demo folder of an earlier call is replaced.
     """
-    if output.exists() and not (output / "demo.json").is_file():
-        raise RecordingError(
-            output, "a path that exists and is no demo", "a new one", "another output"
-        )
+    check_output(output, "demo.json", overwrite=True)
     began = time.perf_counter()
     model = get_model("loose")
     hand_set = as_arrays(model.parameters)
@@ -58,22 +54,25 @@ def demo(output: Path, as_json: bool) -> None:
         )
     note(f"estimating {', '.join(runs.TESTING)}")
     compared = tuning.compare(model, testing, {"hand-set": hand_set, "tuned": tuned.params})
-    tuned.save(output)
     figures = []
-    for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
-        made.save(output / "result" / recording.name, overwrite=True)
-        chosen = FIGURES if recording.name == "constant-rate" else ("attitude", "occlusion")
-        figures += draw(made, recording, output / "figures", chosen)
-    document = {
-        "rows": as_dicts(compared.rows),
-        "mean_attitude_rmse_deg": tuning.mean_by_variant(compared.rows),
-        "noise_deg": {
-            name: float(np.rad2deg(value)) for name, value in tuned.params.noise._asdict().items()
-        },
-        "figures": [str(file) for file in figures],
-        "seconds": round(time.perf_counter() - began, 1),
-    }
-    write_whole(output / "demo.json", json.dumps(document, indent=2) + "\n")
+    with whole_folder(output, "demo.json", overwrite=True) as folder:
+        tuned.save(folder)
+        for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
+            made.save(folder / "result" / recording.name)
+            chosen = FIGURES if recording.name == "constant-rate" else ("attitude", "occlusion")
+            files = draw(made, recording, folder / "figures", chosen)
+            figures += [str(output / "figures" / file.name) for file in files]
+        document = {
+            "rows": as_dicts(compared.rows),
+            "mean_attitude_rmse_deg": tuning.mean_by_variant(compared.rows),
+            "noise_deg": {
+                name: float(np.rad2deg(value))
+                for name, value in tuned.params.noise._asdict().items()
+            },
+            "figures": figures,
+            "seconds": round(time.perf_counter() - began, 1),
+        }
+        (folder / "demo.json").write_text(json.dumps(document, indent=2) + "\n", "utf-8")
     if as_json:
         print_json(document)
         return

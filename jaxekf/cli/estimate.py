@@ -7,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import metrics, parameters, storage
+from jaxekf import manifold, metrics, parameters, storage
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -22,6 +22,9 @@ from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
+from jaxekf.storage import check_output
+
+_SUSPICIOUS_NIS = 3.0
 
 
 def load_runs(paths: Sequence[Path]) -> list[Recording]:
@@ -39,12 +42,30 @@ def load_runs(paths: Sequence[Path]) -> list[Recording]:
 def describe(made: Estimate, recording: Recording) -> dict[str, Any]:
     """Summary of one estimate, with its score where there is an encoder."""
     summary = made.summary()
-    summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
-    summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
+    if "bias" in {part.name for part in manifold.parts(made.model.space)}:
+        summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
+        summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
     if recording.encoder is not None:
         summary["score"] = metrics.score(made, recording).as_dict()
-        summary["hold_last_deg"] = metrics.score_hold_last(recording, made.time_ns)
+        if recording.optical is not None:
+            summary["hold_last_deg"] = metrics.score_hold_last(recording, made.time_ns)
     return summary
+
+
+def warn(made: Estimate) -> None:
+    """Say what a table would hide: rows that fell outside the run, and noise that cannot be right."""
+    for name, count in made.account.items():
+        if count.get("dropped_outside_run"):
+            note(
+                f"{made.run}: {count['dropped_outside_run']} of {count['read']} samples of {name} lie"
+                " outside the run and were dropped"
+            )
+    for name, record in made.sensors.items():
+        if len(record.nis) and made.mean_nis(name) > _SUSPICIOUS_NIS:
+            note(
+                f"{made.run}: innovations of {name} are {made.mean_nis(name):.0f} times larger (squared)"
+                " than the noise says: tune it, or the model does not fit this run"
+            )
 
 
 @click.command()
@@ -68,11 +89,14 @@ def estimate(
     chosen = get_model(model)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs)
+    for recording in recordings:
+        check_output(output / recording.name, "result.json", overwrite=overwrite)
     estimates = estimate_many(recordings, chosen, params)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         folder = made.save(output / recording.name, overwrite=overwrite)
         summaries.append(describe(made, recording) | {"result": str(folder)})
+        warn(made)
         note(f"wrote {folder}")
     if as_json:
         print_json({"model": chosen.name, "runs": summaries})
@@ -85,7 +109,7 @@ def estimate(
         "rate RMSE\n(deg/s)",
         "NEES",
         "tracker\nNIS",
-        "tracker rows\nmasked",
+        "tracker rows\nused",
     ]
     print_table(f"Estimates by {chosen.name}", columns, rows)
 
@@ -100,6 +124,6 @@ def _row(summary: dict[str, Any]) -> list[Any]:
         judged.get("attitude_rmse_deg", nan),
         judged.get("rate_rmse_deg_s", nan),
         judged.get("attitude_nees", nan),
-        summary["mean_nis"].get("optical", nan),
-        f"{account.get('masked', 0)} of {account.get('read', 0)}",
+        summary["mean_nis"].get("optical") or nan,
+        f"{account.get('used', 0)} of {account.get('read', 0)}",
     ]

@@ -7,6 +7,7 @@ import click
 from jaxekf import parameters, plots
 from jaxekf.cli.console import json_option, model_option, noise_option, note, print_json
 from jaxekf.cli.estimate import load_runs
+from jaxekf.errors import ModelError
 from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
@@ -19,6 +20,13 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
     """Write the named figures of one run."""
     folder.mkdir(parents=True, exist_ok=True)
     functions = plots.figure_functions()
+    possible = plots.possible_figures(made, recording)
+    missing = [name for name in names if name not in possible]
+    if missing:
+        raise ModelError(
+            f"run '{made.run}': got the figures {missing}, expected some of {list(possible)} for this"
+            " model and recording; leave the others out"
+        )
     return [
         plots.save(functions[name](made, recording), folder / f"{made.run}_{name}.png")
         for name in names
@@ -54,7 +62,8 @@ def plot(
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
     for made, recording in zip(estimates, recordings, strict=True):
-        files += draw(made, recording, output, figures or FIGURES)
+        names = figures or plots.possible_figures(made, recording)
+        files += draw(made, recording, output, names)
     for file in files:
         note(f"wrote {file}")
     if as_json:

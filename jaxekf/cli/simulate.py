@@ -1,12 +1,23 @@
 """`jaxekf simulate`: recorded runs with known truth."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from jaxekf import simulate as simulator
 from jaxekf import storage
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json
+
+
+class _Finite(click.FloatRange):
+    """A number within bounds; NaN, which is within any, is refused."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        number = super().convert(value, param, ctx)
+        if number != number:
+            self.fail(f"got '{value}', expected a number; try 0", param, ctx)
+        return number
 
 
 def _spans(
@@ -20,6 +31,8 @@ def _spans(
             raise click.BadParameter(
                 f"got '{value}', expected START,END in seconds; try 20,20.5"
             ) from None
+        if not 0.0 <= begin < end:
+            raise click.BadParameter(f"got '{value}', expected 0 <= START < END; try 20,20.5")
         spans.append((begin, end))
     return spans
 
@@ -38,21 +51,31 @@ def _spans(
 @click.option("--runs", type=click.IntRange(1), default=1, show_default=True)
 @click.option(
     "--seed",
-    type=int,
+    type=click.IntRange(0),
     default=0,
     show_default=True,
     help="Of the first run; the next have the next.",
 )
 @click.option(
-    "--duration", type=click.FloatRange(0.5), default=60.0, show_default=True, help="Seconds."
+    "--duration", type=_Finite(0.5, 1e5), default=60.0, show_default=True, help="Seconds."
 )
-@click.option("--rate", type=float, default=-9.0, show_default=True, help="Constant rate, deg/s.")
 @click.option(
-    "--speed", type=float, default=40.0, show_default=True, help="Free motion, deg/s rms per axis."
+    "--rate",
+    type=_Finite(-1e4, 1e4),
+    default=-9.0,
+    show_default=True,
+    help="Constant rate, deg/s.",
+)
+@click.option(
+    "--speed",
+    type=_Finite(-1e4, 1e4),
+    default=40.0,
+    show_default=True,
+    help="Free motion, deg/s rms per axis.",
 )
 @click.option(
     "--rest",
-    type=click.FloatRange(0.0),
+    type=_Finite(0.0),
     default=5.0,
     show_default=True,
     help="Seconds at rest at the start.",
@@ -62,23 +85,39 @@ def _spans(
 )
 @click.option(
     "--dropouts",
-    type=click.FloatRange(0.0, 1.0),
+    type=_Finite(0.0, 1.0),
     default=0.0,
     show_default=True,
     help="Share of tracker samples lost.",
 )
-@click.option("--optical-noise", type=float, default=0.3, show_default=True, help="deg per axis.")
 @click.option(
-    "--gyroscope-noise", type=float, default=0.05, show_default=True, help="deg/s/sqrt(Hz)."
+    "--optical-noise",
+    type=_Finite(0.0, 1e3),
+    default=0.3,
+    show_default=True,
+    help="deg per axis.",
+)
+@click.option(
+    "--gyroscope-noise",
+    type=_Finite(0.0, 1e3),
+    default=0.05,
+    show_default=True,
+    help="deg/s/sqrt(Hz).",
 )
 @click.option(
     "--bias",
-    type=float,
+    type=_Finite(0.0, 1e3),
     default=0.5,
     show_default=True,
     help="deg/s, standard deviation at the start.",
 )
-@click.option("--bias-walk", type=float, default=0.005, show_default=True, help="deg/s^2/sqrt(Hz).")
+@click.option(
+    "--bias-walk",
+    type=_Finite(0.0, 1e3),
+    default=0.005,
+    show_default=True,
+    help="deg/s^2/sqrt(Hz).",
+)
 @overwrite_option
 @json_option
 def simulate(
@@ -106,6 +145,8 @@ def simulate(
         bias_deg=bias,
         optical_deg=optical_noise,
     )
+    for number in range(seed, seed + runs):
+        storage.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
     written = []
     for number in range(seed, seed + runs):
         chosen = (

@@ -13,12 +13,14 @@ from jaxekf.cli.console import (
     model_option,
     noise_option,
     note,
+    overwrite_option,
     print_json,
     print_table,
     tuning_progress,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.models import get_model
+from jaxekf.storage import check_output
 from tuning.noise import AXES
 from tuning.objectives import parse
 from tuning.validation import as_dicts
@@ -48,9 +50,8 @@ from tuning.validation import as_dicts
 @click.option(
     "--axes",
     type=click.Choice(AXES),
-    default="tied",
-    show_default=True,
-    help="One deviation for all axes, one for each, or a full matrix.",
+    default=None,
+    help="One deviation for all axes, one for each, or a full matrix.  [default: as the start has it]",
 )
 @click.option("--iterations", type=click.IntRange(1), default=60, show_default=True)
 @click.option(
@@ -75,6 +76,7 @@ from tuning.validation import as_dicts
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
 )
+@overwrite_option
 @json_option
 def tune(
     runs: tuple[Path, ...],
@@ -83,12 +85,13 @@ def tune(
     noise_files: tuple[str, ...],
     objective: str,
     free: tuple[str, ...],
-    axes: str,
+    axes: str | None,
     iterations: int,
     patience: int,
     burn_in: float,
     rescale: bool | None,
     output: Path,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Tune on RUNS and write noise.toml and calibration.toml.
@@ -96,9 +99,14 @@ def tune(
     --noise gives the start; the model's defaults otherwise.
     """
     chosen = get_model(model)
+    check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
     training, held_out = load_runs(runs), load_runs(validate)
     aim = parse(objective)
+    if aim.errors:
+        for run in training + held_out:
+            if run.encoder is None:
+                note(f"run '{run.name}' has no encoder and does not count in the error")
     with tuning_progress(iterations) as progress:
         tuned = tuning.tune(
             training,

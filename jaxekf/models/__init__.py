@@ -33,10 +33,10 @@ def get_model(model: str | Model) -> Model:
         sys.path.insert(0, os.getcwd())
     try:
         found = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # a user's module may raise anything while it is imported
         raise ModelError(
-            f"got the model '{model}', expected an importable module with that attribute ({error});"
-            " check the name and the folder you are in"
+            f"got the model '{model}', expected an importable module with that attribute"
+            f" ({type(error).__name__}: {error}); check the name, the folder you are in, and the module"
         ) from error
     if not isinstance(found, Model):
         raise ModelError(

@@ -63,13 +63,14 @@ def _rate(x: State, measured: Array, params: Parameters) -> Array:
 
 
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
-    """``q exp(rate dt + w_angle)`` and ``bias + w_bias``."""
-    turn = _rate(x, u.mean, params) * dt + w[:3]
+    """``q exp(gyroscope_matrix @ ((mean rate - bias) dt + w_angle))`` and ``bias + w_bias``."""
+    matrix = params.calibration.gyroscope_matrix
+    turn = matrix @ ((u.mean - x.bias) * dt + w[:3])
     return State(SO3().retract(x.q_ref_body, turn), x.bias + w[3:])
 
 
 def process_noise(params: Parameters, dt: Array) -> Array:
-    """Covariance (6, 6) of the angle and bias noise over ``dt``.
+    """Covariance (6, 6) of the angle and bias noise over ``dt``, in the gyroscope's own axes.
 
     Exact for the double integrator, so that cutting a step in two changes nothing: the bias walks
     while it is being integrated.

@@ -2,7 +2,8 @@
 
 Cheng's (2023) state with an error-state attitude and body rates: 9 degrees of freedom. The rate is a
 random walk driven by a density of angular acceleration, so that smooth motion filters the
-gyroscope's own noise, which `loose` does not.
+gyroscope's own noise, which `loose` does not. That density says how the tool moves, which only the
+recordings know: tune it before use.
 """
 
 from collections.abc import Mapping
@@ -97,7 +98,7 @@ def initial_covariance(params: Parameters) -> Array:
 
 DEFAULTS = Parameters(
     Noise(
-        acceleration=np.deg2rad(30.0),
+        acceleration=np.deg2rad(10.0),
         gyroscope=np.deg2rad(0.05),
         bias_walk=np.deg2rad(0.005),
         optical=np.deg2rad(0.3),

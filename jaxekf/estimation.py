@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import ekf, manifold, parameters, storage, timeline
+from jaxekf import ekf, manifold, padding, parameters, storage, timeline
 from jaxekf.ekf import FilterOutput
 from jaxekf.errors import FilterError, PrecisionError
 from jaxekf.model import Belief, Model, Parameters
@@ -79,12 +79,12 @@ def filter_timelines(
 
 def bucketed(lines: Sequence[Timeline]) -> Steps:
     """Stacked steps, padded to one of a few lengths so that few programs are ever compiled."""
-    steps = timeline.stack(list(lines))
+    steps = padding.stack(list(lines))
     runs, epochs, substeps = steps.dt.shape
-    longer = timeline.bucket(epochs)
-    knots = None if steps.knots is None else timeline.bucket(steps.knots.time.shape[1])
+    longer = padding.bucket(epochs)
+    knots = None if steps.knots is None else padding.bucket(steps.knots.time.shape[1])
     ones = [jax.tree.map(lambda a, i=i: a[i], steps) for i in range(runs)]
-    padded = [timeline.pad(one, longer, substeps, knots) for one in ones]
+    padded = [padding.pad(one, longer, substeps, knots) for one in ones]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
 
 
@@ -143,16 +143,16 @@ def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
 
 def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
     """The sensors used at a broken substep, or the prediction where that was broken already."""
-    predicted = np.diagonal(np.asarray(output.instants.predicted.cov)[: len(line.time_ns)][k, s])
+    epochs, substeps = line.time_ns.shape
+    predicted = np.asarray(output.instants.predicted.cov)[:epochs, -substeps:][k, s].diagonal()
     if not np.all(np.isfinite(predicted) & (predicted >= 0.0)):
         return "in the prediction"
-    last = s == line.time_ns.shape[1] - 1
     used = []
     for name in model_sensors(line):
+        rows = np.asarray(output.innovations[name].used)
         fast = name in line.steps.fast
-        if (fast or last) and np.asarray(output.innovations[name].used)[
-            (k, s) if fast else k
-        ].any():
+        here = rows[:epochs, -substeps:][k, s] if fast else rows[k] & (s == substeps - 1)
+        if here.any():
             used.append(name)
     return f"in the update by sensor {' and '.join(used)}"
 

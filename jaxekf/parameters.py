@@ -11,8 +11,9 @@ import numpy as np
 import tomli_w
 
 from jaxekf.errors import ModelError, RecordingError
+from jaxekf.files import write_whole
 from jaxekf.model import Model, Parameters
-from jaxekf.storage import SCHEMA_VERSION, write_whole
+from jaxekf.storage import SCHEMA_VERSION
 
 _SECTIONS = Parameters._fields
 

@@ -10,9 +10,11 @@ import jax
 import numpy as np
 
 from jaxekf import manifold, parameters
+from jaxekf.files import whole_folder
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import NANOSECONDS, Floats, Times
-from jaxekf.storage import SCHEMA_VERSION, whole_folder, write_csv
+from jaxekf.storage import SCHEMA_VERSION
+from jaxekf.tables import write_csv
 
 
 @dataclass(frozen=True)

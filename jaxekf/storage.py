@@ -8,33 +8,36 @@ Times are decimal seconds, read exactly to the nanosecond. `recording.toml` says
 Folders are written whole or not at all.
 """
 
-import csv
-import shutil
-import tempfile
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import contextmanager
-from decimal import Decimal, InvalidOperation
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import tomli_w
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxekf.errors import RecordingError
+from jaxekf.files import whole_folder
 from jaxekf.recording import (
-    NANOSECONDS,
     Encoder,
     Floats,
     Imu,
     Optical,
     Recording,
-    Times,
     from_scipy,
     to_scipy,
     unit_quaternions,
+)
+from jaxekf.tables import (
+    Table,
+    finite_numbers,
+    flags,
+    need_columns,
+    numbers,
+    read_table,
+    read_times,
+    write_csv,
 )
 
 SCHEMA_VERSION = 1
@@ -45,15 +48,6 @@ _DESCRIBED = {
     "encoder": {"quaternion": _BODY_TO_REFERENCE},
 }
 _QUATERNION = ("qw", "qx", "qy", "qz")
-
-
-class Table(NamedTuple):
-    """A CSV file as text, its rows with the number of their line."""
-
-    path: Path
-    columns: tuple[str, ...]
-    rows: list[list[str]]
-    lines: list[int]
 
 
 def load(path: Path | str) -> Recording:
@@ -71,7 +65,7 @@ def load(path: Path | str) -> Recording:
     for label, reader in readers.items():
         file = folder / f"{label}.csv"
         if file.exists() or label in about:
-            read[label] = reader(_read_table(file), about.get(label, {}))
+            read[label] = reader(read_table(file), about.get(label, {}))
     if not read:
         raise RecordingError(
             folder, "no stream", "optical.csv, imu.csv or encoder.csv", "another folder"
@@ -126,166 +120,34 @@ def _read_description(folder: Path) -> Mapping[str, Any]:
     return about
 
 
-def _read_table(path: Path) -> Table:
-    if not path.is_file():
-        raise RecordingError(
-            path, "no such file", "the stream named in recording.toml", "adding it"
-        )
-    try:
-        text = path.read_text("utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise RecordingError(
-            path, f"unreadable text ({error})", "UTF-8", "saving as UTF-8"
-        ) from error
-    rows, lines = [], []
-    reader = csv.reader(text.splitlines())
-    for row in reader:
-        if row:
-            rows.append(row)
-            lines.append(reader.line_num)
-    if not rows:
-        raise RecordingError(
-            path, "an empty file", "a header and samples", "exporting the run again"
-        )
-    columns = tuple(cell.strip() for cell in rows[0])
-    if len(rows) == 1:
-        raise RecordingError(path, "0 samples", "at least one", "exporting the run again", line=1)
-    if len(set(columns)) != len(columns):
-        raise RecordingError(path, f"columns {list(columns)}", "each once", "renaming one", line=1)
-    for row, line in zip(rows[1:], lines[1:], strict=True):
-        if len(row) != len(columns):
-            raise RecordingError(
-                path,
-                f"{len(row)} cells",
-                f"{len(columns)} as in the header",
-                "completing the row or removing it",
-                line=line,
-            )
-    return Table(path, columns, rows[1:], lines[1:])
-
-
-def _need_columns(table: Table, allowed: Iterable[Sequence[str]], optional: Sequence[str]) -> None:
-    """The columns are one of the allowed sets plus any of the optional ones."""
-    choices = list(allowed)
-    for choice in choices:
-        extra = set(table.columns) - set(choice)
-        if set(choice) <= set(table.columns) and extra <= set(optional):
-            return
-    wanted = " or ".join(",".join(choice) for choice in choices)
-    more = f" (and any of {','.join(optional)})" if optional else ""
-    raise RecordingError(
-        table.path,
-        f"columns {','.join(table.columns)}",
-        f"{wanted}{more}",
-        "renaming or adding columns",
-        line=1,
-    )
-
-
-def _numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
-    """Columns as float64 (N, len(names)); with `blank`, empty cells are NaN."""
-    values = np.empty((len(table.rows), len(names)))
-    for j, name in enumerate(names):
-        at = table.columns.index(name)
-        for i, row in enumerate(table.rows):
-            cell = row[at].strip()
-            try:
-                values[i, j] = np.nan if blank and not cell else float(cell)
-            except ValueError:
-                raise RecordingError(
-                    table.path,
-                    f"'{cell}'",
-                    "a number",
-                    "correcting the cell",
-                    line=table.lines[i],
-                    column=name,
-                ) from None
-    return values
-
-
-def _finite(table: Table, names: tuple[str, ...]) -> Floats:
-    values = _numbers(table, names)
-    bad = np.argwhere(~np.isfinite(values))
-    if bad.size:
-        i, j = (int(at) for at in bad[0])
-        raise RecordingError(
-            table.path,
-            f"{values[i, j]}",
-            "a finite number",
-            "removing the row",
-            line=table.lines[i],
-            column=names[j],
-        )
-    return values
-
-
-def parse_seconds(text: str) -> int:
-    """Decimal seconds to nanoseconds, exactly; digits beyond the ninth are rounded."""
-    whole, _, part = text.partition(".")
-    if whole.isdigit() and len(part) <= 9 and (part.isdigit() or not part):
-        return int(whole) * NANOSECONDS + int(part.ljust(9, "0") or 0)
-    return int((Decimal(text) * NANOSECONDS).to_integral_value())
-
-
-def _times(table: Table) -> Times:
-    at = table.columns.index("time")
-    times = np.empty(len(table.rows), np.int64)
-    for i, row in enumerate(table.rows):
-        cell = row[at].strip()
-        try:
-            times[i] = parse_seconds(cell)
-        except (InvalidOperation, ValueError, OverflowError):
-            raise RecordingError(
-                table.path,
-                f"'{cell}'",
-                "a time in seconds",
-                "correcting the cell",
-                line=table.lines[i],
-                column="time",
-            ) from None
-    backwards = np.flatnonzero(np.diff(times) <= 0)
-    if backwards.size:
-        i = int(backwards[0]) + 1
-        raise RecordingError(
-            table.path,
-            f"{table.rows[i][at].strip()} after {table.rows[i - 1][at].strip()}",
-            "times that increase",
-            "sorting the rows and removing duplicates",
-            line=table.lines[i],
-            column="time",
-        )
-    return times
-
-
 def _optical(table: Table, about: Mapping[str, Any]) -> Optical:
-    _need_columns(table, [("time", *_QUATERNION)], ("x", "y", "z", "status", "error"))
-    q, valid = unit_quaternions(_numbers(table, _QUATERNION, blank=True))
+    need_columns(table, [("time", *_QUATERNION)], ("x", "y", "z", "status", "error"))
+    q, valid = unit_quaternions(numbers(table, _QUATERNION, blank=True))
     position = None
     if {"x", "y", "z"} <= set(table.columns):
-        position = _numbers(table, ("x", "y", "z"), blank=True)
+        position = numbers(table, ("x", "y", "z"), blank=True)
     if "status" in table.columns:
         at = table.columns.index("status")
         words = about.get("status_ok", ["ok", "0"])
         words = words if isinstance(words, list) else [words]
         good = {str(word).strip().lower() for word in words}
         valid &= np.array([row[at].strip().lower() in good for row in table.rows])
-    return Optical(_times(table), q, valid, position)
+    return Optical(read_times(table), q, valid, position)
 
 
 def _imu(table: Table, about: Mapping[str, Any]) -> Imu:
     acceleration, field = ("ax", "ay", "az"), ("mx", "my", "mz")
-    _need_columns(table, [("time", "gx", "gy", "gz")], acceleration + field)
+    need_columns(table, [("time", "gx", "gy", "gz")], acceleration + field)
 
     def maybe(names: tuple[str, ...]) -> Floats | None:
-        return _finite(table, names) if set(names) <= set(table.columns) else None
+        return finite_numbers(table, names) if set(names) <= set(table.columns) else None
 
-    return Imu(_times(table), _finite(table, ("gx", "gy", "gz")), maybe(acceleration), maybe(field))
-
-
-def _flags(table: Table, name: str) -> NDArray[np.bool_]:
-    if name not in table.columns:
-        return np.ones(len(table.rows), bool)
-    return _finite(table, (name,))[:, 0] != 0.0
+    return Imu(
+        read_times(table),
+        finite_numbers(table, ("gx", "gy", "gz")),
+        maybe(acceleration),
+        maybe(field),
+    )
 
 
 def _encoder(table: Table, about: Mapping[str, Any]) -> Encoder:
@@ -295,15 +157,15 @@ def _encoder(table: Table, about: Mapping[str, Any]) -> Encoder:
     (``acts_on = "body"``), ``exp(axis angle) q_zero`` where it is fixed in the reference.
     ``q_optical_encoder`` turns the encoder's frame into the tracker's.
     """
-    _need_columns(table, [("time", "angle"), ("time", *_QUATERNION)], ("scored",))
-    scored = _flags(table, "scored")
+    need_columns(table, [("time", "angle"), ("time", *_QUATERNION)], ("scored",))
+    scored = flags(table, "scored")
     if "angle" in table.columns:
-        q = joint_attitude(_finite(table, ("angle",))[:, 0], about, table.path)
+        q = joint_attitude(finite_numbers(table, ("angle",))[:, 0], about, table.path)
         valid = np.ones(len(q), bool)
     else:
-        q, valid = unit_quaternions(_numbers(table, _QUATERNION, blank=True))
+        q, valid = unit_quaternions(numbers(table, _QUATERNION, blank=True))
     frame = _fixed_rotation(about, "q_optical_encoder", table.path)
-    return Encoder(_times(table), from_scipy(frame * to_scipy(q)), valid, scored & valid)
+    return Encoder(read_times(table), from_scipy(frame * to_scipy(q)), valid, scored & valid)
 
 
 def _vector(value: Any, size: int, place: Path | str, name: str) -> Floats:
@@ -343,75 +205,6 @@ def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -
 
 # ---------------------------------------------------------------------------------------------
 # Writing
-
-
-def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> None:
-    """Raise `RecordingError` where an output folder may not be written: see `whole_folder`."""
-    target = Path(path)
-    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return
-    if not (target / marker).is_file():
-        raise RecordingError(
-            target, f"a path that exists and holds no {marker}", "a new one", "another output"
-        )
-    if not overwrite:
-        raise RecordingError(
-            target, "a path that exists", "a new one", "another output or the overwrite option"
-        )
-
-
-@contextmanager
-def whole_folder(path: Path | str, marker: str, *, overwrite: bool = False) -> Any:
-    """A temporary folder beside `path` that becomes it when the block ends well, and is gone if not.
-
-    With `overwrite` it replaces an older folder of the same kind: one that holds the file `marker`.
-    """
-    check_output(path, marker, overwrite=overwrite)
-    target = Path(path).resolve()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
-        yield temporary
-        temporary.chmod(0o755)
-        if target.is_dir():
-            shutil.rmtree(target)
-        temporary.rename(target)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-
-
-def write_whole(path: Path | str, text: str) -> None:
-    """Write a text file by a temporary one and a rename, so that it is never half there."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=target.parent, prefix=f".{target.name}-", delete=False
-    ) as file:
-        temporary = Path(file.name)
-        file.write(text)
-    temporary.chmod(0o644)
-    temporary.replace(target)
-
-
-def format_seconds(time_ns: int) -> str:
-    """Nanoseconds as decimal seconds, exactly, without trailing zeros."""
-    sign, size = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
-    whole, part = divmod(int(size), NANOSECONDS)
-    digits = f"{part:09d}".rstrip("0")
-    return f"{sign}{whole}.{digits}" if digits else f"{sign}{whole}"
-
-
-def write_csv(
-    path: Path, columns: Sequence[str], time_ns: Times, values: Floats, digits: int
-) -> None:
-    """A CSV file of a time column and numbers; NaN is written as a blank cell."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time", *columns])
-        for time, row in zip(time_ns, values, strict=True):
-            cells = ["" if np.isnan(v) else f"{v:.{digits}g}" for v in row]
-            writer.writerow([format_seconds(int(time)), *cells])
 
 
 def save(

@@ -13,11 +13,11 @@ ROOT = Path(__file__).parents[1]
 # A module may import those before it. What stands in one entry does not import its neighbours.
 ORDER = [
     ("errors",),
-    ("rotation", "linalg", "recording"),
-    ("manifold",),
+    ("rotation", "linalg", "recording", "files"),
+    ("manifold", "tables"),
     ("model",),
     ("timeline",),
-    ("interpolation",),
+    ("interpolation", "padding"),
     ("ekf", "models.sources", "storage"),
     ("models.loose",),
     ("models.loose_rate", "models.loose_additive"),

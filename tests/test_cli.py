@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def runs(tmp_path_factory):
         "--json",
     )
     assert result.exit_code == 0, result.output
-    return [jaxekf.storage.Path(path) for path in json.loads(result.stdout)["runs"]]
+    return [Path(path) for path in json.loads(result.stdout)["runs"]]
 
 
 def test_simulate_writes_runs(runs):
@@ -56,7 +57,7 @@ def test_estimate_writes_results(runs, tmp_path):
     document = json.loads(result.stdout)
     assert [run["run"] for run in document["runs"]] == ["free-3", "free-4"]
     for run in document["runs"]:
-        assert (jaxekf.storage.Path(run["result"]) / "estimate.csv").is_file()
+        assert (Path(run["result"]) / "estimate.csv").is_file()
         assert run["score"]["attitude_rmse_deg"] < 0.5 * run["hold_last_deg"]
     again = call("estimate", *runs, "-o", tmp_path / "out")
     assert again.exit_code == 1
@@ -103,7 +104,7 @@ def test_plot_draws_what_is_asked(runs, tmp_path):
 
 def test_own_model_by_name(tmp_path, monkeypatch):
     """Would catch --model module:attribute that does not find a file in the current folder."""
-    examples = jaxekf.storage.Path(__file__).parents[1] / "examples"
+    examples = Path(__file__).parents[1] / "examples"
     monkeypatch.chdir(examples)
     run = demo.FOLDER / "free-5"
     result = call("estimate", run, "--model", "own_model:MODEL", "-o", tmp_path / "out", "--json")

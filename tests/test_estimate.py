@@ -9,7 +9,7 @@ import pytest
 
 import jaxekf
 from jaxekf import estimation as host
-from jaxekf import metrics, simulate, timeline
+from jaxekf import metrics, padding, simulate
 from jaxekf.datasets import demo
 from jaxekf.errors import FilterError, ModelError, PrecisionError
 from jaxekf.models import REGISTRY
@@ -57,7 +57,7 @@ def test_unequal_lengths_and_buckets():
 @pytest.mark.parametrize("count", [1, 4, 5, 9, 1000, 1025])
 def test_buckets_waste_little(count):
     """Would catch buckets that are too small or too coarse."""
-    assert count <= timeline.bucket(count) <= max(1.26 * count, count + 1)
+    assert count <= padding.bucket(count) <= max(1.26 * count, count + 1)
 
 
 @pytest.mark.parametrize("name", REGISTRY)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenario
 
-from jaxekf import ekf, rotation, timeline
+from jaxekf import ekf, padding, rotation, timeline
 from jaxekf.models import REGISTRY
 
 NAMES = ("loose", "loose_rate", "loose_additive")
@@ -89,7 +89,7 @@ def test_padding_is_inert(name):
     _, params, first, steps, truth = prepared(name)
     model = REGISTRY[name]
     epochs = len(steps.dt)
-    padded = timeline.pad(steps, epochs + 3, 2)
+    padded = padding.pad(steps, epochs + 3, 2)
     if padded.knots is not None:
         more = timeline.Knots(
             *(
@@ -125,7 +125,7 @@ def test_stacked_runs_of_unequal_length():
         first = {"optical": run.optical[0], "gyroscope": run.gyroscope[0]}
         lines.append(timeline.from_steps(str(seed), steps, first))
         beliefs.append(ekf.initial_belief(model, params, first))
-    stacked = timeline.stack(lines)
+    stacked = padding.stack(lines)
     last = scenario.run_filter_quick(
         model, params, beliefs[1], jax.tree.map(lambda a: a[1], stacked)
     ).instants

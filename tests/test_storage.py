@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxekf
-from jaxekf import simulate, storage
+from jaxekf import files, simulate, storage, tables
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Encoder, Imu, Optical, Recording
 
@@ -58,7 +58,7 @@ def test_round_trip(tmp_path, motion):
 @given(st.integers(0, 2**62))
 def test_times_are_exact(time_ns):
     """Would catch a time that passes through a float: 1.7e9 s has steps of 238 ns there."""
-    assert storage.parse_seconds(storage.format_seconds(time_ns)) == time_ns
+    assert tables.parse_seconds(tables.format_seconds(time_ns)) == time_ns
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_times_are_exact(time_ns):
 )
 def test_times_in_other_writing(text, expected):
     """Would catch a parser that knows one way to write a number only."""
-    assert storage.parse_seconds(text) == expected
+    assert tables.parse_seconds(text) == expected
 
 
 def test_encoder_frames_and_sides(tmp_path):
@@ -84,7 +84,7 @@ def test_encoder_frames_and_sides(tmp_path):
             "q_zero": np.roll(zero.as_quat(), 1).tolist(),
             "q_optical_encoder": np.roll(frame.as_quat(), 1).tolist(),
         }
-        table = storage.Table(tmp_path, ("time", "angle"), [["0", "0.7"]], [2])
+        table = tables.Table(tmp_path, ("time", "angle"), [["0", "0.7"]], [2])
         return Rotation.from_quat(np.roll(storage._encoder(table, about).q_ref_body[0], -1))
 
     for side, expected in (("reference", frame * turn * zero), ("body", frame * zero * turn)):
@@ -216,7 +216,7 @@ def test_recordings_in_memory_are_checked(make):
 def test_output_is_whole_or_not_there(tmp_path):
     """Would catch a half-written folder, or an old result lost to a failed new one."""
     target = tmp_path / "out"
-    with pytest.raises(ZeroDivisionError), storage.whole_folder(target, "recording.toml") as folder:
+    with pytest.raises(ZeroDivisionError), files.whole_folder(target, "recording.toml") as folder:
         (folder / "a").write_text("half")
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
@@ -226,7 +226,7 @@ def test_output_is_whole_or_not_there(tmp_path):
     before = sorted(p.name for p in target.iterdir())
     with (
         pytest.raises(ZeroDivisionError),
-        storage.whole_folder(target, "recording.toml", overwrite=True),
+        files.whole_folder(target, "recording.toml", overwrite=True),
     ):
         raise ZeroDivisionError
     assert sorted(p.name for p in target.iterdir()) == before
@@ -248,9 +248,9 @@ def test_overwriting_replaces_only_its_own_kind(tmp_path):
     """Would catch a result that replaces the recording it came from."""
     target = storage.save(constant(), tmp_path / "run")
     with pytest.raises(RecordingError, match=r"holds no result.json"):
-        storage.check_output(target, "result.json", overwrite=True)
+        files.check_output(target, "result.json", overwrite=True)
     (tmp_path / "empty").mkdir()
-    storage.check_output(tmp_path / "empty", "result.json")
+    files.check_output(tmp_path / "empty", "result.json")
     (tmp_path / "link").symlink_to(target)
     storage.save(constant(2), tmp_path / "link", overwrite=True)
     assert (tmp_path / "link").is_symlink()

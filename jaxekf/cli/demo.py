@@ -12,9 +12,10 @@ from jaxekf.cli.console import json_option, note, print_json, tuning_progress
 from jaxekf.cli.plot import FIGURES, draw
 from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo as runs
+from jaxekf.files import check_output, whole_folder
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
-from jaxekf.storage import check_output, load, whole_folder
+from jaxekf.storage import load
 from tuning.validation import as_dicts
 
 # What one would write down from data sheets: a gyroscope's best case, a tracker's worst.

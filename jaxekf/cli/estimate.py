@@ -19,10 +19,10 @@ from jaxekf.cli.console import (
 )
 from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
+from jaxekf.files import check_output
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
-from jaxekf.storage import check_output
 
 _SUSPICIOUS_NIS = 3.0
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
+from jaxekf import files, storage
 from jaxekf import simulate as simulator
-from jaxekf import storage
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json
 
 
@@ -146,7 +146,7 @@ def simulate(
         optical_deg=optical_noise,
     )
     for number in range(seed, seed + runs):
-        storage.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
+        files.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
     written = []
     for number in range(seed, seed + runs):
         chosen = (

@@ -19,8 +19,8 @@ from jaxekf.cli.console import (
     tuning_progress,
 )
 from jaxekf.cli.estimate import load_runs
+from jaxekf.files import check_output
 from jaxekf.models import get_model
-from jaxekf.storage import check_output
 from tuning.noise import AXES
 from tuning.objectives import parse
 from tuning.validation import as_dicts

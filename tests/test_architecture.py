@@ -17,7 +17,7 @@ ORDER = [
     ("manifold", "tables"),
     ("model",),
     ("timeline",),
-    ("interpolation", "padding"),
+    ("interpolation", "padding", "linearise"),
     ("ekf", "models.sources", "storage"),
     ("models.loose",),
     ("models.loose_rate", "models.loose_additive"),

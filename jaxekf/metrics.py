@@ -78,3 +78,11 @@ def score_hold_last(recording: Recording, time_ns: Times) -> float:
     held = hold_last(recording.need_optical(), time_ns)
     error = attitude_error(held[truth.scored], truth.q_ref_body[truth.scored])
     return float(np.rad2deg(rms(error)))
+
+
+def score_raw_rate(recording: Recording) -> float:
+    """Rate RMSE in deg/s of the gyroscope as it is, bias and noise included."""
+    imu = recording.need_imu()
+    scored = encoder_at(recording.need_encoder(), imu.time_ns).scored
+    error = imu.gyroscope - encoder_rate_at(recording.need_encoder(), imu.time_ns)
+    return float(np.rad2deg(rms(error[scored])))

@@ -141,6 +141,8 @@ def test_demo_does_the_main_job(tmp_path):
     mean = document["mean_attitude_rmse_deg"]
     assert mean["tuned"] < 0.9 * mean["hand-set"]
     assert mean["tuned"] < 0.05 * mean["hold last"]
+    rates = {row["variant"]: row["rate_rmse_deg_s"] for row in document["rows"]}
+    assert rates["tuned"] < rates["hold last"]
     folder = tmp_path / "demo"
     figures = {p.stem for p in (folder / "figures").iterdir()}
     assert {

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from jaxekf import storage
 from jaxekf.estimation import Run, estimate_many
-from jaxekf.metrics import score, score_hold_last
+from jaxekf.metrics import score, score_hold_last, score_raw_rate
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
@@ -37,7 +37,7 @@ def compare(
 ) -> Comparison:
     """Estimate every run with every choice of parameters; the first rows hold the last tracker sample.
 
-    `hold last` has no rate but the gyroscope's own, which is not scored, and no covariance: NaN.
+    The rate of `hold last` is the gyroscope's own; it has no covariance, so that NIS and NEES are NaN.
     """
     recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
     estimates = {name: estimate_many(recordings, model, p) for name, p in variants.items()}
@@ -47,7 +47,8 @@ def compare(
         times = next(iter(estimates.values()))[i].time_ns
         if recording.optical is not None:
             held = score_hold_last(recording, times)
-            rows.append(Row(recording.name, "hold last", held, nan, nan, nan))
+            raw = nan if recording.imu is None else score_raw_rate(recording)
+            rows.append(Row(recording.name, "hold last", held, raw, nan, nan))
         for name, made in estimates.items():
             judged = score(made[i], recording)
             rows.append(

@@ -110,10 +110,10 @@ def tune(
 
     `objective` is the attitude error unless given. `free` names what may change (default: all noise);
     `axes` gives what is free one deviation for all axes (`tied`), one for `each`, or a `full` matrix;
-    None leaves it as the start has it. L-BFGS is
-    the optimiser unless an optax one is given. The best parameters so far are kept, by the validation
-    runs where there are any; the tuner stops when they have not improved for `patience` iterations.
-    Steps that are not finite are rejected, shortened and counted.
+    None leaves it as the start has it. L-BFGS is the optimiser unless an optax one is given. The best
+    parameters so far are kept, by the validation runs where there are any; the tuner stops when they
+    have not improved for `patience` iterations. Steps that are not finite are rejected, shortened and
+    counted. Ctrl-C ends the search and keeps the best so far.
 
     The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when the
     likelihood is not in the objective) they are scaled afterwards so that the training errors match
@@ -221,9 +221,9 @@ class _Search:
         progress: Progress | None,
     ) -> tuple[Array, Iteration, list[Iteration], str]:
         walk = _Walk(self.layout.to_free(self.base), optimiser)
-        best_free, best_judged, since = walk.candidate, float("inf"), 0
-        best: Iteration | None = None
         history: list[Iteration] = []
+        best_judged, since = float("inf"), 0
+        stopped = f"the {iterations} iterations asked for are done"
         for number in range(iterations):
             value, gradient = self.value_and_gradient(walk.candidate)
             finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
@@ -232,30 +232,26 @@ class _Search:
             history.append(step)
             if progress is not None:
                 progress(step, iterations)
-            if best is None and not finite:
-                raise TuningError(
-                    f"got an objective of {value} or a gradient that is not finite at the start,"
-                    " expected finite ones; start from other noise or check the data"
-                )
             judged = value if self.validation is None else held
             if finite and judged < best_judged:
-                if best is None or judged < best_judged - _IMPROVEMENT * abs(best_judged):
+                if judged < best_judged - _IMPROVEMENT * abs(judged):
                     since = number
-                best_free, best, best_judged = walk.candidate, step, judged
-                self.found = (best_free, best, history)
-            if number - since >= patience:
-                return (
-                    best_free,
-                    step if best is None else best,
-                    history,
-                    (f"no improvement in {patience} iterations"),
+                best_judged = judged
+                self.found = (walk.candidate, step, history)
+            if self.found is None:
+                raise TuningError(
+                    f"got an objective of {judged} or a gradient that is not finite at the start,"
+                    " expected finite ones; start from other noise or check the data"
                 )
-            done = walk.move(value, gradient, finite)
-            if done:
-                return best_free, step if best is None else best, history, done
-        if best is None:
+            if number - since >= patience:
+                stopped = f"no improvement in {patience} iterations"
+                break
+            if reason := walk.move(value, gradient, finite):
+                stopped = reason
+                break
+        if self.found is None:
             raise TuningError(f"got {iterations} iterations, expected at least one; ask for more")
-        return best_free, best, history, f"the {iterations} iterations asked for are done"
+        return *self.found, stopped
 
 
 class _Walk:

@@ -16,6 +16,14 @@ settings.load_profile("jaxekf")
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _forget_compiled_programs():
+    """Drop the programs of each file at its end: every one holds memory maps, of which a process may
+    have only so many, and the compiler crashes when they run out."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of recorded data: ``$JAXEKF_DATA``, or ``../shared/data`` by the repository."""

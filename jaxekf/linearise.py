@@ -1,47 +1,68 @@
 """First-order models of a transition and of a measurement, in tangent spaces, for one run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jaxekf import linalg, manifold
+from jaxekf import manifold
 from jaxekf.model import Model, Parameters, Sensor
 from jaxekf.timeline import Rows
 
 
 def linearise_transition(
-    model: Model, params: Parameters, x: Any, u: Any, dt: Array
+    model: Model,
+    params: Parameters,
+    x: Any,
+    u: Any,
+    dt: Array,
+    state_columns: Sequence[int] | None = None,
+    noise_columns: Sequence[int] | None = None,
 ) -> tuple[Any, Array, Array]:
     """The predicted state and the Jacobians F (n, n) and G (n, n_w) of its error vector, for one run.
 
     ``F`` is with respect to the error of ``x``, ``G`` to the process noise; both in the tangent
-    space at the prediction.
+    space at the prediction. Of each, only the columns named are made (None for all).
     """
     size = model.process_noise(params, dt).shape[0]
     dtype = manifold.dtype_of(x)
     still = jnp.zeros(size, dtype)
-    predicted = model.transition(x, u, dt, still, params)
 
-    def error(delta: Array, noise: Array) -> Array:
-        def moved(x: Any, w: Array) -> Any:
-            return model.transition(x, u, dt, w, params)
+    def moved(x: Any, w: Array) -> Any:
+        return model.transition(x, u, dt, w, params)
 
-        changes = (manifold.lift(model.space, x, delta), noise)
-        return manifold.lower(model.space, predicted, jax.jvp(moved, (x, still), changes)[1])
+    predicted = moved(x, still)
 
-    n = model.error_dim
-    basis = jnp.eye(n + size, dtype=dtype)
-    both = jax.vmap(error, out_axes=1)(basis[:, :n], basis[:, n:])
-    return predicted, both[:, :n], both[:, n:]
+    def by_state(delta: Array) -> Array:
+        change = manifold.lift(model.space, x, delta)
+        found = jax.jvp(lambda x: moved(x, still), (x,), (change,))[1]
+        return manifold.lower(model.space, predicted, found)
+
+    def by_noise(noise: Array) -> Array:
+        found = jax.jvp(lambda w: moved(x, w), (still,), (noise,))[1]
+        return manifold.lower(model.space, predicted, found)
+
+    f = _columns(by_state, model.error_dim, dtype, model.error_dim, state_columns)
+    return predicted, f, _columns(by_noise, size, dtype, model.error_dim, noise_columns)
 
 
 def linearise_sensor(
-    model: Model, sensor: Sensor, params: Parameters, x: Any, u: Any, rows: Rows
+    model: Model,
+    sensor: Sensor,
+    params: Parameters,
+    x: Any,
+    u: Any,
+    rows: Rows,
+    columns: Sequence[int] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Residual, Jacobian (rows, n) and noise (rows, rows) of one sample at the state ``x``, for one
-    run; hidden rows are inert (no residual, no slope, unit noise)."""
+    """Residual, Jacobian (rows, n) and noise (rows, rows) of one sample at the state ``x``, for one run.
+
+    Hidden rows have no residual; their slope and noise are left to the caller. Of the Jacobian only the
+    columns named are made (None for all).
+    """
     expected = sensor.predict(x, u, params, rows.aux)
 
     def error(delta: Array) -> Array:
@@ -51,11 +72,21 @@ def linearise_sensor(
         change = jax.jvp(moved, (x,), (manifold.lift(model.space, x, delta),))[1]
         return manifold.lower(sensor.space, expected, change)
 
-    jacobian = jax.vmap(error, out_axes=1)(jnp.eye(model.error_dim, dtype=manifold.dtype_of(x)))
+    jacobian = _columns(error, model.error_dim, manifold.dtype_of(x), sensor.rows, columns)
     value = _neutral(sensor.space, rows.value, rows.mask, expected)
     residual = jnp.where(rows.mask, manifold.local(sensor.space, expected, value), 0.0)
-    noise = linalg.mask_covariance(sensor.noise(params, rows.aux, rows.dt), rows.mask)
-    return residual, jnp.where(rows.mask[:, None], jacobian, 0.0), noise
+    return residual, jacobian, sensor.noise(params, rows.aux, rows.dt)
+
+
+def _columns(
+    derivative: Any, size: int, dtype: Any, rows: int, columns: Sequence[int] | None
+) -> Array:
+    """The chosen columns of a Jacobian, (rows, columns)."""
+    basis = np.eye(size)
+    basis = basis if columns is None else basis[list(columns)]
+    if basis.shape[0] == 0:
+        return jnp.zeros((rows, 0), dtype)
+    return jax.vmap(derivative, out_axes=1)(jnp.asarray(basis, dtype))
 
 
 def _neutral(space: Any, value: Any, mask: Array, predicted: Any) -> Any:

@@ -309,11 +309,16 @@ def reset_jacobian(space: Any, delta: Array) -> Array:
     ``J(delta)`` times the old one (Sola, Deray, Atchuthan 2018, eq. 67 for rotations).
     """
     size = error_dim(space)
-    jacobian = jnp.eye(size, dtype=delta.dtype)
-    for part in filter(lambda part: part.manifold.curved, parts(space)):
-        block = part.manifold.reset_jacobian(delta[part.error])
-        jacobian = jacobian.at[part.error, part.error].set(block)
-    return jacobian
+    rows = []
+    for part in parts(space):
+        dim, start = part.manifold.dim, part.error.start
+        block = jnp.eye(dim, dtype=delta.dtype)
+        if part.manifold.curved:
+            block = part.manifold.reset_jacobian(delta[part.error])
+        before, after = jnp.zeros((dim, start)), jnp.zeros((dim, size - start - dim))
+        pieces = [before.astype(delta.dtype), block, after.astype(delta.dtype)]
+        rows.append(jnp.concatenate(pieces, axis=1))
+    return jnp.concatenate(rows)
 
 
 def dtype_of(state: Any) -> Any:

@@ -12,7 +12,7 @@ import scenario
 import toy_models
 from scipy.stats import chi2
 
-from jaxekf import ekf, interpolation, manifold, timeline
+from jaxekf import ekf, interpolation, linearise, manifold, timeline
 from jaxekf.model import Belief, Model
 from jaxekf.models import REGISTRY
 from jaxekf.timeline import Rows, Steps
@@ -121,7 +121,7 @@ def test_retract_and_local(model):
     assert_tree_close(reached, other, 1e-14)
 
 
-linearise = scenario.quick_jit(ekf.linearise_transition, static_argnums=0)
+linearise_quickly = scenario.quick_jit(linearise.linearise_transition, static_argnums=0)
 
 
 @partial(scenario.quick_jit, static_argnums=0)
@@ -166,7 +166,7 @@ def test_transition_jacobians(model, seed):
     """A lift or lower that loses part of a derivative, or a transition that jumps."""
     given, params = data(model, 0), parameters(model)
     x, u, dt = moved(model, given.mean, seed), input_at(model, given.flat), jnp.asarray(0.03)
-    predicted, f, g = linearise(model, params, x, u, dt)
+    predicted, f, g = linearise_quickly(model, params, x, u, dt)
     n, m, step = model.error_dim, g.shape[1], 1e-5
     basis = step * np.concatenate([np.eye(n + m), -np.eye(n + m)])
     errors = transition_errors(model, params, x, u, dt, basis[:, :n], basis[:, n:])
@@ -182,7 +182,7 @@ def test_process_noise_vanishes_with_the_step(model):
     given, params = data(model, 0), parameters(model)
     np.testing.assert_array_equal(model.process_noise(params, jnp.asarray(0.0)), 0.0)
     x, u = moved(model, given.mean, 3), input_at(model, given.flat)
-    predicted, f, _ = linearise(model, params, x, u, jnp.asarray(0.0))
+    predicted, f, _ = linearise_quickly(model, params, x, u, jnp.asarray(0.0))
     np.testing.assert_allclose(f, np.eye(model.error_dim), rtol=0, atol=1e-15)
     assert_tree_close(predicted, x, 1e-15)
 
@@ -200,7 +200,7 @@ def test_sensor_jacobians(model):
     for sensor in model.sensors:
         rows = jax.tree.map(lambda a: jnp.asarray(a[1]), seen[sensor.name])
         rows = rows._replace(mask=jnp.ones(sensor.rows, bool))
-        _, h, noise = ekf.linearise_sensor(model, sensor, params, x, u, rows)
+        _, h, noise = linearise.linearise_sensor(model, sensor, params, x, u, rows)
         errors = sensor_errors(model, sensor, params, x, u, rows.aux, deltas)
         assert_jacobian(h, central(errors, step))
         assert np.linalg.eigvalsh(noise).min() > 0.0
@@ -224,7 +224,7 @@ def test_masked_step_only_predicts(model):
     after, u = jax.tree.map(lambda a: a[-1], in_order)
     dt = jnp.asarray(given.epochs.dt[-1, -1])
     assert dt > 0.0
-    predicted, f, g = linearise(model, params, before.mean, u, dt)
+    predicted, f, g = linearise_quickly(model, params, before.mean, u, dt)
     cov = f @ before.cov @ f.T + g @ model.process_noise(params, dt) @ g.T
     assert_tree_close(after, Belief(predicted, cov), 1e-13)
 

@@ -9,7 +9,7 @@ import scenario
 import toy_models
 from filterpy.kalman import KalmanFilter
 
-from jaxekf import ekf
+from jaxekf import linearise
 from jaxekf.interpolation import InputSample
 from jaxekf.model import Belief
 from jaxekf.models import REGISTRY
@@ -155,7 +155,7 @@ def added_noise(model, params, dt):
     q = jnp.array([1.0, 0.0, 0.0, 0.0])
     x = model.space._make([q] + [zero] * (len(model.space) - 1))
     u = InputSample(zero, zero, jnp.zeros(()))
-    _, f, g = ekf.linearise_transition(model, params, x, u, dt)
+    _, f, g = linearise.linearise_transition(model, params, x, u, dt)
     return f, g @ model.process_noise(params, dt) @ g.T
 
 

@@ -1,0 +1,194 @@
+"""A traced function of one run as a flat list of operations that can be read, cut and evaluated.
+
+The filter needs to know more about a model's functions than how to call them: which numbers of a
+Jacobian are always zero or one, which operations depend on parameters only, and how to do the same work
+for many runs at once. All three are answered from the list of operations.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend import core
+
+_REARRANGED = {"broadcast_in_dim", "reshape", "slice", "squeeze", "stack", "transpose", "unstack"}
+_INLINED = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat"}
+
+
+class Constant(NamedTuple):
+    """An operand that is not computed."""
+
+    value: Any
+
+
+class Operation(NamedTuple):
+    """One primitive applied to constants and numbered values."""
+
+    primitive: Any
+    params: dict[str, Any]
+    inputs: tuple[Any, ...]
+    outputs: tuple[int, ...]
+    shapes: tuple[Any, ...]
+    """Shape and dtype of each output."""
+
+    def bind(self, values: Sequence[Any]) -> list[Any]:
+        """The outputs for the given operands."""
+        # Until JAX 0.7 the functions among the parameters came apart from the rest.
+        given = self.primitive.get_bind_params(self.params)
+        functions, params = given if isinstance(given, tuple) else ((), given)
+        found = self.primitive.bind(*functions, *values, **params)
+        return list(found) if self.primitive.multiple_results else [found]
+
+
+class Program(NamedTuple):
+    """Operations in order; values are numbered, inputs first."""
+
+    inputs: tuple[Any, ...]
+    """Shape and dtype of each input."""
+    operations: tuple[Operation, ...]
+    outputs: tuple[Any, ...]
+    """Numbers of values, or constants."""
+    tree: Any
+    """Structure of the outputs."""
+
+    def evaluate(self, values: Sequence[Any]) -> Any:
+        """The outputs for one run."""
+        known = dict(enumerate(values))
+
+        def read(operand: Any) -> Any:
+            return operand.value if isinstance(operand, Constant) else known[operand]
+
+        for operation in self.operations:
+            found = operation.bind([read(i) for i in operation.inputs])
+            known.update(zip(operation.outputs, found, strict=True))
+        return jax.tree.unflatten(self.tree, [read(o) for o in self.outputs])
+
+
+def trace(function: Callable[..., Any], *args: Any) -> Program:
+    """The operations of ``function(*args)``; its inputs are the leaves of `args` in order."""
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+    tree = jax.tree.structure(shapes)
+    operations: list[Operation] = []
+    inputs = tuple(_spec(v) for v in closed.jaxpr.invars)
+    counter = [len(inputs)]
+    constants = [Constant(value) for value in closed.consts]
+    outputs = _flatten(closed.jaxpr, constants, list(range(len(inputs))), operations, counter)
+    return _without_dead(Program(inputs, tuple(operations), tuple(outputs), tree))
+
+
+def split(program: Program, first: int) -> tuple[Program, Program]:
+    """Cut off what depends on nothing but the first inputs.
+
+    Returns the program that computes it from the first `first` inputs (its outputs are a list), and
+    the rest, whose inputs are those values followed by the remaining inputs.
+    """
+    early, fixed, made = set(range(first)), set(), {}
+    before, after = [], []
+    for operation in program.operations:
+        operands = [i for i in operation.inputs if not isinstance(i, Constant)]
+        made.update((o, operation) for o in operation.outputs)
+        if fixed.issuperset(operands):
+            # Needed on both sides perhaps, and made of constants: no value to hand over.
+            fixed.update(operation.outputs)
+            before.append(operation)
+            after.append(operation)
+        elif (early | fixed).issuperset(operands):
+            early.update(operation.outputs)
+            before.append(operation)
+        else:
+            after.append(operation)
+    late = _without_dead(program._replace(operations=tuple(after))).operations
+    needed, moved = _frontier(program, late, early, made)
+    places = {o.outputs[0] for o in after} | moved
+    after = [o for o in program.operations if o.outputs[0] in places]
+    specs = dict(enumerate(program.inputs))
+    for operation in before:
+        specs.update(zip(operation.outputs, operation.shapes, strict=True))
+    tree = jax.tree.structure([0] * len(needed))
+    head = _without_dead(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
+    number = {old: new for new, old in enumerate(needed)}
+    rest = range(first, len(program.inputs))
+    number |= {old: len(needed) + i for i, old in enumerate(rest)}
+    inputs = (*[specs[i] for i in needed], *program.inputs[first:])
+    count = len(inputs)
+    renumbered = []
+    for operation in after:
+        operands = tuple(i if isinstance(i, Constant) else number[i] for i in operation.inputs)
+        for output in operation.outputs:
+            number[output], count = count, count + 1
+        outputs = tuple(number[o] for o in operation.outputs)
+        renumbered.append(operation._replace(inputs=operands, outputs=outputs))
+    outputs = tuple(o if isinstance(o, Constant) else number[o] for o in program.outputs)
+    return head, _without_dead(Program(inputs, tuple(renumbered), outputs, program.tree))
+
+
+def _frontier(
+    program: Program, late: Sequence[Operation], early: set[int], made: dict[int, Operation]
+) -> tuple[list[int], set[int]]:
+    """The early values that the late operations need, and what is made late all the same.
+
+    What only rearranges an early value is done late, so that fewer numbers are handed over.
+    """
+    wanted = [i for operation in late for i in operation.inputs] + list(program.outputs)
+    wanted = [i for i in dict.fromkeys(_numbers(wanted)) if i in early]
+    needed: list[int] = []
+    moved: set[int] = set()
+    while wanted:
+        value = wanted.pop()
+        operation = made.get(value)
+        if operation is not None and operation.primitive.name in _REARRANGED:
+            moved.add(operation.outputs[0])
+            wanted += [i for i in _numbers(operation.inputs) if i in early and i not in moved]
+        elif value not in needed:
+            needed.append(value)
+    return needed, moved
+
+
+def _numbers(operands: Sequence[Any]) -> list[int]:
+    return [i for i in operands if not isinstance(i, Constant)]
+
+
+def _spec(variable: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(variable.aval.shape, variable.aval.dtype)
+
+
+def _flatten(
+    jaxpr: Any, constants: list[Any], values: list[Any], operations: list[Operation], counter: list
+) -> list[Any]:
+    """Append the operations of `jaxpr`, nested calls opened; the operands that are its outputs."""
+    number = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *values], strict=True))
+
+    def read(atom: Any) -> Any:
+        if isinstance(atom, core.Literal):
+            return Constant(np.asarray(atom.val, atom.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
+        return number[atom]
+
+    for eqn in jaxpr.eqns:
+        operands = [read(atom) for atom in eqn.invars]
+        if eqn.primitive.name in _INLINED:
+            inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
+            consts = [Constant(c) for c in getattr(inner, "consts", ())]
+            inner = getattr(inner, "jaxpr", inner)
+            found = _flatten(inner, consts, operands, operations, counter)
+        else:
+            found = list(range(counter[0], counter[0] + len(eqn.outvars)))
+            counter[0] += len(found)
+            shapes = tuple(_spec(v) for v in eqn.outvars)
+            operation = Operation(
+                eqn.primitive, dict(eqn.params), tuple(operands), tuple(found), shapes
+            )
+            operations.append(operation)
+        number.update(zip(eqn.outvars, found, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _without_dead(program: Program) -> Program:
+    """The program without what no output needs."""
+    needed = {o for o in program.outputs if not isinstance(o, Constant)}
+    kept = []
+    for operation in reversed(program.operations):
+        if needed.intersection(operation.outputs):
+            kept.append(operation)
+            needed.update(i for i in operation.inputs if not isinstance(i, Constant))
+    return program._replace(operations=tuple(reversed(kept)))

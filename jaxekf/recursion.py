@@ -1,0 +1,366 @@
+"""The recursion over time: many runs in blocks of lanes, and its derivative by the adjoint.
+
+Arguments and results carry the runs on their first axis. Inside, a block of runs lies on the last axis
+and one scan takes it through time. The derivative goes back through the same steps, each linearised
+again from the belief it started from: nothing but beliefs is kept.
+"""
+
+import math
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+
+from jaxekf import kernels
+from jaxekf.model import Belief
+from jaxekf.step import Moment, Outcome, advance
+from jaxekf.system import System
+
+LANES = 16
+"""Runs in a block: wide enough to fill vector registers, small enough to stay in the first cache."""
+_LARGEST_UNROLLED_SUBSTEPS = 2
+
+
+class Given(NamedTuple):
+    """What the recursion is driven with; leading axes (K, S), slow samples (K,)."""
+
+    moments: Moment
+    fast: Any
+    slow: Any
+
+
+class Kept(NamedTuple):
+    """What of every substep is kept; leading axes (K, S). None where it was not asked for."""
+
+    prior: Belief | None
+    mean: Any
+    cov: Array | None
+    log_likelihood: Array
+    healthy: Array
+    used: Any
+    """By sensor; (K, S, rows) for fast sensors, (K, rows) for slow ones."""
+    gated: Any
+
+
+class What(NamedTuple):
+    """What to keep besides means and log-likelihoods."""
+
+    prior: bool
+    cov: bool
+    used: bool
+
+
+def _keep(what: What, outcome: Outcome) -> Kept:
+    return Kept(
+        outcome.prior if what.prior else None,
+        outcome.posterior.mean,
+        outcome.posterior.cov if what.cov else None,
+        outcome.log_likelihood,
+        outcome.healthy,
+        outcome.used if what.used else {},
+        outcome.gated if what.used else {},
+    )
+
+
+def _epoch(
+    system: System, what: What, adjoint: bool, prepared: Any, belief: Belief, given: Given
+) -> tuple[Belief, Kept]:
+    """All substeps of one epoch; slow sensors are taken at the last."""
+    every = (given.moments, given.fast)
+
+    def substep(belief: Belief, moment: Moment, samples: Any) -> tuple[Belief, Kept]:
+        outcome = advance(system, prepared, belief, moment, samples, adjoint=adjoint)
+        return outcome.posterior, _keep(what, outcome)
+
+    count = given.moments.dt.shape[0] - 1
+    moment, fast = jax.tree.map(lambda a: a[-1], every)
+    if count == 0:
+        belief, last = substep(belief, moment, fast | given.slow)
+        return belief, _gathered(None, last, given.slow)
+    before = jax.tree.map(lambda a: a[:-1], every)
+    unroll = count <= _LARGEST_UNROLLED_SUBSTEPS
+    belief, earlier = lax.scan(lambda b, g: substep(b, *g), belief, before, unroll=unroll)
+    belief, last = substep(belief, moment, fast | given.slow)
+    return belief, _gathered(earlier, last, given.slow)
+
+
+def _gathered(earlier: Kept | None, last: Kept, slow: Any) -> Kept:
+    """The substeps of an epoch one after the other; what slow sensors did apart from them."""
+    ended = [{name: v for name, v in part.items() if name in slow} for part in last[-2:]]
+    fast = [{name: v for name, v in part.items() if name not in slow} for part in last[-2:]]
+    last = last._replace(used=fast[0], gated=fast[1])
+    if earlier is None:
+        whole = jax.tree.map(lambda a: a[None], last)
+    else:
+        whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
+    return whole._replace(used=whole.used | ended[0], gated=whole.gated | ended[1])
+
+
+# --- one block of runs, on lanes ----------------------------------------------------------------------
+
+
+def _scan(
+    system: System, what: What, adjoint: bool, segment: int | None, prepared: Any, belief: Belief, given: Given
+) -> tuple[Kept, Belief | None]:
+    """All epochs; also, where `segment` is given, the belief at the start of every `segment` epochs."""
+    epoch = partial(_epoch, system, what, adjoint, prepared)
+    if segment is None:
+        return lax.scan(epoch, belief, given)[1], None
+
+    def stretch(belief: Belief, given: Given) -> tuple[Belief, tuple[Kept, Belief]]:
+        if segment == 1:
+            after, kept = epoch(belief, given)
+        else:
+            after, kept = lax.scan(epoch, belief, given)
+        return after, (kept, belief)
+
+    epochs = given.moments.dt.shape[0]
+    if segment > 1:
+        given = _cut(given, segment)
+    kept, starts = lax.scan(stretch, belief, given)[1]
+    if segment > 1:
+        kept = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], kept)
+    return kept, starts
+
+
+def _cut(tree: Any, segment: int) -> Any:
+    """Arrays (K, ...) in segments (K / segment, segment, ...), the last filled with inert steps."""
+
+    def cut(a: Array) -> Array:
+        more = -a.shape[0] % segment
+        if more:
+            # Zeros are inert: no time passes and no row is visible.
+            a = jnp.concatenate([a, jnp.zeros((more, *a.shape[1:]), a.dtype)])
+        return a.reshape(-1, segment, *a.shape[1:])
+
+    return jax.tree.map(cut, tree)
+
+
+class _Flags:
+    """Facts about the leaves of a tree that are known when the program is traced."""
+
+    def __init__(self, given: tuple[bool, ...]) -> None:
+        self.given = given
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Flags) and self.given == other.given
+
+    def __hash__(self) -> int:
+        return hash(self.given)
+
+
+jax.tree_util.register_static(_Flags)
+
+
+def _scan_back(
+    system: System,
+    what: What,
+    segment: int,
+    moving: tuple[bool, ...],
+    live: tuple[bool, ...],
+    prepared: Any,
+    starts: Belief,
+    given: Given,
+    cotangents: list[Array],
+) -> tuple[Any, Belief, list[Array]]:
+    """Cotangents of what was prepared, of the first belief, and of the moving leaves of `given`.
+
+    `cotangents` are those of the live leaves of `Kept`; the others have none.
+    """
+    leaves, tree = jax.tree.flatten(given)
+    floats, moving_prepared = _inexact(prepared)
+
+    def back(carry: Any, at: Any) -> Any:
+        after, total = carry
+        start, leaves, cotangents = at
+
+        def forward(floats: list[Array], belief: Belief, moved: list[Array]) -> Any:
+            full = _merge(moving, moved, leaves)
+            values = moving_prepared(floats)
+            belief, kept = _epoch(
+                system, what, True, values, belief, jax.tree.unflatten(tree, full)
+            )
+            return belief, [v for f, v in zip(live, jax.tree.leaves(kept), strict=True) if f]
+
+        moved = [v for f, v in zip(moving, leaves, strict=True) if f]
+        _, pull = jax.vjp(forward, floats, start, moved)
+        gained, before, of_given = pull((after, cotangents))
+        return (before, jax.tree.map(jnp.add, total, gained)), of_given
+
+    zero = jax.tree.map(lambda a: jnp.zeros(a.shape[1:], a.dtype), starts)
+    carry = (zero, jax.tree.map(jnp.zeros_like, floats))
+    if segment == 1:
+        given_back = (starts, leaves, cotangents)
+        (first, total), of_given = lax.scan(back, carry, given_back, reverse=True)
+        return total, first, of_given
+    epochs = given.moments.dt.shape[0]
+    ahead = partial(_epoch, system, What(False, False, False), False, prepared)
+
+    def stretch(carry: Any, at: Any) -> Any:
+        start, leaves, cotangents = at
+
+        def step(belief: Belief, given: Given) -> tuple[Belief, Belief]:
+            return ahead(belief, given)[0], belief
+
+        _, beliefs = lax.scan(step, start, jax.tree.unflatten(tree, leaves))
+        return lax.scan(back, carry, (beliefs, leaves, cotangents), reverse=True)
+
+    pieces = (starts, _cut(leaves, segment), _cut(cotangents, segment))
+    (first, total), of_given = lax.scan(stretch, carry, pieces, reverse=True)
+    of_given = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], of_given)
+    return total, first, of_given
+
+
+def _inexact(tree: Any) -> tuple[list[Array], Callable[[list[Array]], Any]]:
+    """The floating-point leaves of a tree, and how to put others in their place."""
+    leaves, structure = jax.tree.flatten(tree)
+    flags = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
+
+    def put(floats: list[Array]) -> Any:
+        return jax.tree.unflatten(structure, _merge(flags, floats, leaves))
+
+    return [leaf for f, leaf in zip(flags, leaves, strict=True) if f], put
+
+
+def _merge(flags: Any, chosen: list[Any], others: list[Any]) -> list[Any]:
+    found = iter(chosen)
+    return [next(found) if f else other for f, other in zip(flags, others, strict=True)]
+
+
+# --- all runs -----------------------------------------------------------------------------------------
+
+
+def _in_blocks(function: Callable[..., Any], *trees: Any) -> Any:
+    """``function`` of trees with lanes last, for runs on the first axis in blocks of `LANES`."""
+    runs = jax.tree.leaves(trees)[0].shape[0]
+    size = runs if runs <= LANES else LANES
+    count = -(-runs // size)
+
+    def cut(a: Array) -> Array:
+        more = count * size - runs
+        if more:
+            a = jnp.concatenate([a, jnp.broadcast_to(a[-1:], (more, *a.shape[1:]))])
+        return a.reshape(count, size, *a.shape[1:])
+
+    def one(trees: Any) -> Any:
+        lanes_last = jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), trees)
+        return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), function(*lanes_last))
+
+    if count == 1:
+        return one(trees)
+    found = lax.map(one, jax.tree.map(cut, trees))
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:runs], found)
+
+
+def _over_more_runs(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of runs on the first axis, whose `vmap` is the same function of more runs."""
+    mapped = custom_vmap(function)
+
+    @mapped.def_vmap
+    def _(size: int, batched: Any, *args: Any) -> Any:
+        def merge(flag: bool, a: Array) -> Array:
+            if not flag:
+                a = jnp.broadcast_to(a, (size, *a.shape))
+            return a.reshape(-1, *a.shape[2:])
+
+        found = mapped(*jax.tree.map(merge, tuple(batched), tuple(args)))
+        found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return mapped
+
+
+def _whole(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as one piece of code where the model allows it."""
+    return partial(kernels.block, function) if system.is_plain else function
+
+
+def filter_plainly(
+    system: System, what: What, checkpoint: bool, prepared: Any, belief: Belief, given: Given
+) -> Kept:
+    """The recursion with JAX's own derivatives, forward and reverse."""
+
+    def runs(prepared: Any, belief: Belief, given: Given) -> Kept:
+        epoch = partial(_epoch, system, what, False, prepared)
+        if checkpoint:
+            epoch = jax.checkpoint(epoch)
+        return lax.scan(epoch, belief, given)[1]
+
+    return _in_blocks(runs, prepared, belief, given)
+
+
+def filter_with_adjoint(
+    system: System, what: What, segment: int, prepared: Any, belief: Belief, given: Given
+) -> Kept:
+    """The recursion with its reverse derivative by the adjoint; `segment` epochs between kept beliefs."""
+    return _with_adjoint(system, what, segment)(prepared, belief, given)
+
+
+@lru_cache(maxsize=64)
+def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kept]:
+    def run(segment: int | None, *trees: Any) -> Any:
+        scan = partial(_scan, system, what, False, segment)
+        return _in_blocks(_whole(system, scan), *trees)
+
+    ahead = _over_more_runs(lambda *trees: run(None, *trees)[0])
+    ahead_saving = _over_more_runs(partial(run, segment))
+
+    @jax.custom_vjp
+    def function(prepared: Any, belief: Belief, given: Given) -> Kept:
+        return ahead(prepared, belief, given)
+
+    def forward(prepared: Any, belief: Belief, given: Given) -> Any:
+        flags = tuple(
+            bool(leaf.perturbed) and jnp.issubdtype(leaf.value.dtype, jnp.inexact)
+            for leaf in jax.tree.leaves(given)
+        )
+        values = jax.tree.map(lambda leaf: leaf.value, (prepared, belief, given))
+        kept, starts = ahead_saving(*values)
+        return kept, (values[0], starts, values[2], _Flags(flags))
+
+    def backward(saved: Any, cotangents: Any) -> Any:
+        prepared, starts, given, flags = saved
+        every = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
+        live = tuple(
+            not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
+        )
+        chosen = [c for flag, c in zip(live, every, strict=True) if flag]
+        total, first, of_given = _backward(system, what, segment, flags.given, live)(
+            prepared, starts, given, chosen
+        )
+        return _unfilled(prepared, None, total), first, _unfilled(given, flags.given, of_given)
+
+    function.defvjp(forward, backward, symbolic_zeros=True)
+    return function
+
+
+@lru_cache(maxsize=256)
+def _backward(
+    system: System, what: What, segment: int, moving: tuple[bool, ...], live: tuple[bool, ...]
+) -> Callable[..., Any]:
+    scan = partial(_scan_back, system, what, segment, moving, live)
+    return _over_more_runs(partial(_in_blocks, _whole(system, scan)))
+
+
+def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:
+    """Cotangents in the structure of `tree`: those found, and zeros for the others."""
+    leaves, structure = jax.tree.flatten(tree)
+    if flags is None:
+        flags = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
+    others = [
+        None if jnp.issubdtype(leaf.dtype, jnp.inexact) else np.zeros(leaf.shape, jax.dtypes.float0)
+        for leaf in leaves
+    ]
+    merged = _merge(flags, found, others)
+    return jax.tree.unflatten(structure, merged)
+
+
+def segment_length(epochs: int, bytes_per_epoch: int, budget: int = 1 << 28) -> int:
+    """Epochs between kept beliefs: 1 while all fit into the budget, else about the square root."""
+    return 1 if epochs * bytes_per_epoch <= budget else max(1, math.isqrt(epochs))

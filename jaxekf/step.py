@@ -1,0 +1,238 @@
+"""One step of the filter on lanes: predict, compare, update."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from scipy.stats import chi2
+
+from jaxekf import algebra, linalg, patterned
+from jaxekf.algebra import Gained
+from jaxekf.lanes import written_sum
+from jaxekf.model import Belief, Sensor
+from jaxekf.patterned import Pattern
+from jaxekf.system import Measurement, System, Transition
+from jaxekf.timeline import Rows
+
+_LARGEST_BLOCK = 7
+_MOST_BLOCKS = 4
+
+
+class Moment(NamedTuple):
+    """What a substep is given besides samples."""
+
+    dt: Array
+    u: Any
+
+
+class Outcome(NamedTuple):
+    """What one substep leaves behind."""
+
+    prior: Belief
+    posterior: Belief
+    log_likelihood: Array
+    healthy: Array
+    used: dict[str, Array]
+    """By sensor: (rows, lanes) rows that entered the update."""
+    gated: dict[str, Array]
+
+
+class _Linear(NamedTuple):
+    """One sensor linearised: rows, and the pattern of their slope."""
+
+    slope: Pattern
+    rows: algebra.Rows
+
+
+def advance(
+    system: System,
+    prepared: Any,
+    belief: Belief,
+    moment: Moment,
+    samples: dict[str, Rows],
+    *,
+    adjoint: bool,
+) -> Outcome:
+    """Predict to the end of one substep and take every sensor sampled there.
+
+    With `adjoint` reverse derivatives are the closed forms of `jaxekf.algebra`; without, every
+    derivative is JAX's own.
+    """
+    prior = _predict(system.transition, prepared["transition"], belief, moment, adjoint)
+    linear: dict[str, _Linear] = {}
+    gated: dict[str, Array] = {}
+    for name, sample in samples.items():
+        measurement = system.measurements[name]
+        constants = prepared[f"sensor {name}"]
+        found = measurement.piece(constants, prior.mean, moment.u, sample, adjoint=adjoint)
+        one = _hide(measurement, *found, sample.mask)
+        gated[name] = _gate(measurement.sensor, one, prior.cov)
+        linear[name] = _without(one, gated[name])
+    used = {name: one.rows.mask for name, one in linear.items()}
+    lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
+    if not linear:
+        nothing = jnp.zeros(lanes, dtype)
+        return Outcome(prior, prior, nothing, _is_sound(prior.cov), used, gated)
+    gained = Gained(prior.cov, jnp.zeros(prior.cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
+    smallest = jnp.ones(lanes, dtype)
+    for slope, rows in _blocks(system, linear):
+        gained, pivot = _take(slope, gained, rows, adjoint)
+        smallest = jnp.minimum(smallest, pivot)
+    posterior = _correct(system, prepared["correction"], prior, gained, list(used.values()), adjoint)
+    healthy = (smallest > 0.0) & _is_sound(posterior.cov)
+    return Outcome(prior, posterior, gained.log_likelihood, healthy, used, gated)
+
+
+def _is_sound(cov: Array) -> Array:
+    """Whether all variances are finite and not negative."""
+    smallest = largest = cov[0, 0]
+    for i in range(1, cov.shape[0]):
+        smallest = jnp.minimum(smallest, cov[i, i])
+        largest = jnp.maximum(largest, cov[i, i])
+    return (smallest >= 0.0) & (largest < jnp.inf)
+
+
+def _congruence(p: Pattern, block: Array | None, cov: Array, adjoint: bool) -> Array:
+    if adjoint:
+        return algebra.congruence_with_adjoint(p)(block, cov)
+    return algebra.congruence(p, block, cov)[0]
+
+
+def _predict(
+    transition: Transition, constants: Any, belief: Belief, moment: Moment, adjoint: bool
+) -> Belief:
+    """The belief at the end of the substep: ``P = F P F' + G Sigma G'``."""
+    mean, f, g, sigma = transition.piece(
+        constants, belief.mean, moment.u, moment.dt, adjoint=adjoint
+    )
+    cov = _congruence(transition.state, f, belief.cov, adjoint)
+    direct = transition.noise.is_identity
+    if transition.diagonal:
+        sigma = algebra.on_diagonal(sigma)
+    elif direct:
+        sigma = algebra.symmetric(sigma)
+    return Belief(mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint)))
+
+
+def _hide(
+    measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
+) -> _Linear:
+    """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
+    if slope is not None:
+        rows = patterned.take(mask, measurement.slope.rows, 0)
+        slope = jnp.where(rows[:, None], slope, 0.0)
+    both = mask if measurement.diagonal else mask[:, None] & mask[None]
+    noise = jnp.where(both, noise, 0.0)
+    return _Linear(measurement.slope, algebra.Rows(residual, slope, noise, mask))
+
+
+def _without(linear: _Linear, gated: Array) -> _Linear:
+    return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
+
+
+def squared_distance(residual: Array, cov: Array) -> Array:
+    """``r' inv(S) r`` of a few rows on lanes."""
+    white = linalg.whiten(linalg.whitener(cov), residual)
+    return written_sum([w * w for w in white])
+
+
+def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
+    """Visible rows whose group lies outside its chi-square bound."""
+    rows = linear.rows
+    if sensor.gate is None:
+        return jnp.zeros_like(rows.mask)
+    _, cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
+    cov = algebra.hide(cov, rows.mask)
+    outside: list[Any] = [None] * sensor.rows
+    for members in sensor.group_rows:
+        residual = jnp.stack([rows.residual[i] for i in members])
+        shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
+        freedom = np.arange(1, len(members) + 1)
+        bounds = np.concatenate([[np.inf], chi2.ppf(sensor.gate, freedom)])
+        visible = written_sum([rows.mask[i].astype(int) for i in members])
+        distance = squared_distance(residual, shared)
+        bound = jnp.asarray(bounds[0], distance.dtype)
+        for count in freedom:
+            bound = jnp.where(visible == count, bounds[count], bound)
+        # A distance that is NaN is outside too: such a row must not enter the update.
+        rejected = jnp.logical_not(distance <= bound)
+        for row in members:
+            outside[row] = rejected
+    return lax.stop_gradient(jnp.stack(outside) & rows.mask)
+
+
+def _take(slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool) -> tuple[Gained, Array]:
+    if adjoint:
+        return algebra.update_with_adjoint(slope)(gained, rows)
+    return algebra.update(slope, gained, rows)
+
+
+def _blocks(system: System, linear: dict[str, _Linear]) -> list[tuple[Pattern, algebra.Rows]]:
+    """Rows in blocks that are taken at once: whole sensors together while they are small."""
+    groups: list[list[str]] = []
+    size = 0
+    for name, one in linear.items():
+        rows = one.slope.shape[0]
+        if groups and size + rows <= _LARGEST_BLOCK:
+            groups[-1].append(name)
+            size += rows
+        else:
+            groups.append([name])
+            size = rows
+    return [_joined(system, [linear[name] for name in names], names) for names in groups]
+
+
+def _joined(
+    system: System, parts: list[_Linear], names: list[str]
+) -> tuple[Pattern, algebra.Rows]:
+    """Rows of several sensors as one block."""
+    if len(parts) == 1:
+        return parts[0].slope, parts[0].rows
+    slope = patterned.stack([part.slope for part in parts])
+    residual = jnp.concatenate([part.rows.residual for part in parts])
+    mask = jnp.concatenate([part.rows.mask for part in parts])
+    lanes, dtype = residual.shape[-1], residual.dtype
+    unknown = None
+    if slope.rows:
+        whole = [patterned.dense(p.slope, p.rows.slope, lanes, dtype) for p in parts]
+        stacked = patterned.take(jnp.concatenate(whole), slope.rows, 0)
+        unknown = patterned.take(stacked, slope.cols, 1)
+    if all(system.measurements[name].diagonal for name in names):
+        noise = jnp.concatenate([part.rows.noise for part in parts])
+    else:
+        noise = _block_diagonal([part.rows.noise for part in parts])
+    return slope, algebra.Rows(residual, unknown, noise, mask)
+
+
+def _block_diagonal(matrices: list[Array]) -> Array:
+    whole = [algebra.on_diagonal(m) if m.ndim == 2 else m for m in matrices]
+    size, start, rows = sum(m.shape[0] for m in whole), 0, []
+    for m in whole:
+        before = jnp.zeros((m.shape[0], start, m.shape[-1]), m.dtype)
+        after = jnp.zeros((m.shape[0], size - start - m.shape[0], m.shape[-1]), m.dtype)
+        rows.append(jnp.concatenate([before, m, after], axis=1))
+        start += m.shape[0]
+    return jnp.concatenate(rows)
+
+
+def _correct(
+    system: System, constants: Any, prior: Belief, gained: Gained, masks: list[Array], adjoint: bool
+) -> Belief:
+    """The mean moved by the error vector and the covariance counted from there."""
+    every = [mask[i] for mask in masks for i in range(mask.shape[0])]
+    any_used = every[0]
+    for mask in every[1:]:
+        any_used = any_used | mask
+    correction = system.correction
+    mean, reset = correction.piece(constants, prior.mean, gained.delta, any_used, adjoint=adjoint)
+    cov = gained.cov
+    if not correction.reset.is_identity:
+        cov = _congruence(correction.reset, reset, cov, adjoint)
+    return Belief(mean, jnp.where(any_used[None, None], cov, prior.cov))
+
+
+def no_derivative(tree: Any) -> Any:
+    """The tree with all derivatives cut."""
+    return jax.tree.map(lax.stop_gradient, tree)

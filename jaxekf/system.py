@@ -1,0 +1,229 @@
+"""A model made ready for the filter: its functions on lanes, and the structure of its matrices.
+
+All of it is found from the model's functions when a program is traced; a model declares nothing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import lanes, linearise, manifold, patterned, programs, structure
+from jaxekf.model import Model, Sensor
+from jaxekf.patterned import Pattern
+from jaxekf.programs import Program
+
+
+class Piece:
+    """A function of one run, split into what depends on the parameters only and what is done each step."""
+
+    def __init__(self, function: Callable[..., Any], params: Any, *rest: Any) -> None:
+        program = programs.trace(function, params, *rest)
+        self._head, self._body = programs.split(program, len(jax.tree.leaves(params)))
+        self._on_lanes = partial(_on_lanes, self._body)
+        self._pullback: Program | None = None
+        self._with_adjoint = jax.custom_vjp(self._on_lanes)
+        self._with_adjoint.defvjp(lambda *values: (self._on_lanes(*values), values), self._pull)
+
+    def prepare(self, params: Any) -> tuple[Array, ...]:
+        """What the steps need of the parameters, for one run; differentiable and cheap."""
+        return tuple(self._head.evaluate(jax.tree.leaves(params)))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the work of a step is arithmetic only."""
+        return lanes.is_plain(self._body)
+
+    def __call__(self, prepared: Any, *rest: Any, adjoint: bool = False) -> Any:
+        """The function on lanes; with `adjoint` its reverse derivative is one on lanes too."""
+        values = (*prepared, *jax.tree.leaves(rest))
+        found = (self._with_adjoint if adjoint else self._on_lanes)(*values)
+        return jax.tree.unflatten(self._body.tree, found)
+
+    def _pull(self, values: tuple[Any, ...], cotangents: Any) -> tuple[Any, ...]:
+        inexact = [jnp.issubdtype(spec.dtype, jnp.inexact) for spec in self._body.inputs]
+        if self._pullback is None:
+            self._pullback = _pullback(self._body, inexact)
+        found = lanes.evaluate(self._pullback, [*values, *cotangents], values[0].shape[-1])
+        found = iter(found)
+        return tuple(
+            next(found) if flag else np.zeros(value.shape, jax.dtypes.float0)
+            for flag, value in zip(inexact, values, strict=True)
+        )
+
+
+def _on_lanes(body: Program, *values: Array) -> list[Array]:
+    return jax.tree.leaves(lanes.evaluate(body, values, values[0].shape[-1]))
+
+
+def _pullback(body: Program, inexact: list[bool]) -> Program:
+    """The program that turns values and cotangents of outputs into cotangents of inexact inputs."""
+    count = len(body.inputs)
+
+    def pull(*given: Any) -> list[Any]:
+        values, cotangents = given[:count], given[count:]
+
+        def function(*moving: Any) -> list[Any]:
+            moved = iter(moving)
+            full = [next(moved) if f else v for f, v in zip(inexact, values, strict=True)]
+            return jax.tree.leaves(body.evaluate(full))
+
+        moving = [v for f, v in zip(inexact, values, strict=True) if f]
+        return list(jax.vjp(function, *moving)[1](list(cotangents)))
+
+    outputs = jax.eval_shape(lambda *v: jax.tree.leaves(body.evaluate(v)), *body.inputs)
+    return programs.trace(pull, *body.inputs, *outputs)
+
+
+class Transition(NamedTuple):
+    """The transition's mean, Jacobians and noise, and what is known of them."""
+
+    piece: Piece
+    """``(params, x, u, dt)`` to the mean, the unknown blocks of F and G, and the noise."""
+    state: Pattern
+    noise: Pattern
+    diagonal: bool
+    """Whether the noise is diagonal; then it is given as its variances."""
+
+
+class Measurement(NamedTuple):
+    """A sensor's residual, slope and noise, and what is known of them."""
+
+    sensor: Sensor
+    piece: Piece
+    """``(params, x, u, rows)`` to the residual, the unknown block of H, and the noise."""
+    slope: Pattern
+    chunks: tuple[tuple[int, int], ...]
+    """Rows that no correlation of the noise ties to others, as ranges."""
+    diagonal: bool
+
+
+class Correction(NamedTuple):
+    """How an error vector moves the mean, and how the covariance follows."""
+
+    piece: Piece
+    """``(params, x, delta, any_used)`` to the mean and the unknown block of the reset Jacobian."""
+    reset: Pattern
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A model made ready."""
+
+    model: Model
+    transition: Transition
+    measurements: dict[str, Measurement]
+    correction: Correction
+
+    def prepare(self, params: Any) -> dict[str, tuple[Array, ...]]:
+        """What the steps need of the parameters, for one run."""
+        found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
+        found["transition"] = self.transition.piece.prepare(params)
+        found["correction"] = self.correction.piece.prepare(params)
+        return found
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all functions of the model are arithmetic only, so that all steps are one program."""
+        pieces = [m.piece for m in self.measurements.values()]
+        return all(p.is_plain for p in [*pieces, self.transition.piece, self.correction.piece])
+
+
+def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:
+    """The system of a model for one sample of everything: arrays, or their shapes and types."""
+    spec = jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (params, x, u, rows))
+    leaves, tree = jax.tree.flatten(spec)
+    return _build(model, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tree)
+
+
+@lru_cache(maxsize=64)
+def _build(model: Model, leaves: Any, tree: Any) -> System:
+    spec = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    params, x, u, rows = spec
+    measurements = {
+        name: _measurement(model, model.sensor(name), params, x, u, sample)
+        for name, sample in rows.items()
+    }
+    return System(
+        model, _transition(model, params, x, u), measurements, _correction(model, params, x)
+    )
+
+
+def _known(function: Callable[..., Any], *args: Any) -> Any:
+    return structure.find(programs.trace(function, *args))
+
+
+def _is_diagonal(matrix: structure.Known) -> bool:
+    return bool(np.all(matrix.is_zero() | np.eye(matrix.value.shape[0], dtype=bool)))
+
+
+def _diagonal(matrix: Array) -> Array:
+    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
+
+
+def _unknown_block(jacobian: Array, p: Pattern) -> Array | None:
+    """Rows of the unknown block, of a Jacobian that has the block's columns only."""
+    return patterned.take(jacobian, p.rows, 0) if p.rows else None
+
+
+def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
+    dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
+    whole = _known(partial(linearise.linearise_transition, model), params, x, u, dt)
+    state, noise = patterned.pattern(whole[1]), patterned.pattern(whole[2])
+    sigma = _known(model.process_noise, params, dt)
+    diagonal = _is_diagonal(sigma)
+
+    def step(params: Any, x: Any, u: Any, dt: Array) -> Any:
+        predicted, f, g = linearise.linearise_transition(
+            model, params, x, u, dt, state.cols, noise.cols
+        )
+        sigma = model.process_noise(params, dt)
+        sigma = _diagonal(sigma) if diagonal else sigma
+        return predicted, _unknown_block(f, state), _unknown_block(g, noise), sigma
+
+    return Transition(Piece(step, params, x, u, dt), state, noise, diagonal)
+
+
+def _measurement(model: Model, sensor: Sensor, params: Any, x: Any, u: Any, rows: Any) -> Measurement:
+    whole = _known(partial(linearise.linearise_sensor, model, sensor), params, x, u, rows)
+    slope = patterned.pattern(whole[1])
+    tied = ~whole[2].is_zero()
+    diagonal = _is_diagonal(whole[2])
+
+    def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
+        residual, h, noise = linearise.linearise_sensor(model, sensor, params, x, u, rows, slope.cols)
+        noise = _diagonal(noise) if diagonal else noise
+        return residual, _unknown_block(h, slope), noise
+
+    piece = Piece(sample, params, x, u, rows)
+    return Measurement(sensor, piece, slope, _untied(tied), diagonal)
+
+
+def _untied(tied: Any) -> tuple[tuple[int, int], ...]:
+    """The finest ranges of rows between which nothing is correlated."""
+    size = tied.shape[0]
+    cuts = [0] + [i for i in range(1, size) if not (tied[:i, i:].any() or tied[i:, :i].any())]
+    return tuple(zip(cuts, [*cuts[1:], size], strict=True))
+
+
+def _correction(model: Model, params: Any, x: Any) -> Correction:
+    delta = jax.ShapeDtypeStruct((model.error_dim,), manifold.dtype_of(x))
+    used = jax.ShapeDtypeStruct((), jnp.bool_)
+    reset = patterned.pattern(_known(partial(manifold.reset_jacobian, model.space), delta))
+
+    def move(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
+        mean = manifold.retract(model.space, x, delta)
+        if model.project is not None:
+            mean = model.project(mean)
+        mean = manifold.copy_where(any_used, mean, x)
+        if not reset.rows:
+            return mean, None
+        jacobian = manifold.reset_jacobian(model.space, delta)
+        return mean, patterned.take(patterned.take(jacobian, reset.rows, 0), reset.cols, 1)
+
+    return Correction(Piece(move, params, x, delta, used), reset)

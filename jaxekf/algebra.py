@@ -5,7 +5,8 @@ update are those of Parellier, Barrau and Bonnabel (2023), extended to a block o
 others, to the log-likelihood and to the slope of the measurement.
 """
 
-from functools import lru_cache, partial
+import operator
+from functools import lru_cache, partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from jaxekf.lanes import written_sum
 from jaxekf.patterned import Pattern
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+_PIVOTS_PER_LOG = 4
 
 
 def symmetric(matrix: Array) -> Array:
@@ -132,19 +134,88 @@ class Gained(NamedTuple):
     log_likelihood: Array
 
 
-class _Solved(NamedTuple):
-    """What an update and its derivative share."""
+class _Factor(NamedTuple):
+    """``S = sum_k column_k column_k' / pivot_k`` of symmetric positive definite matrices on lanes.
 
-    inverse: Array
-    """Inverse of S, hidden rows as in the identity."""
-    pivots: Array
-    projected: Array
-    """``H P``, hidden rows zero."""
-    scaled: Array
-    """``inv(S) e``."""
-    gain: Array
-    residual: Array
-    noise: Array
+    Column k holds rows k and later. The pivots are those of Cholesky's factor, squared.
+    """
+
+    columns: list[Array]
+    inverses: list[Array]
+
+    @property
+    def pivots(self) -> list[Array]:
+        """(lanes,) each; one that is not positive says that the matrix was not definite."""
+        return [column[0] for column in self.columns]
+
+    def ratio(self, row: int, k: int) -> Array:
+        """Element (row, k) of the unit lower factor."""
+        return self.columns[k][row - k] * self.inverses[k]
+
+
+def factor(size: int, column: Any, *args: Any) -> _Factor:
+    """Factor of symmetric positive definite matrices; no square root is taken.
+
+    ``column(j, *args)`` gives rows j and later of the matrix's column j, (size - j, lanes).
+    """
+    found = _Factor([], [])
+    for j in range(size):
+
+        def eliminated(found: _Factor, *args: Any, j: int = j) -> Array:
+            value = column(j, *args)
+            for k, earlier in enumerate(found.columns):
+                value = value - earlier[j - k :] * found.ratio(j, k)[None]
+            return value
+
+        found.columns.append(loop(eliminated, found, *args))
+        found.inverses.append(loop(lambda column: 1.0 / column[0], found.columns[j]))
+    return found
+
+
+def forward(factored: _Factor, right: list[Array]) -> list[Array]:
+    """Rows of ``inv(L) @ right``, L the unit lower factor; rows are (lanes,) or (n, lanes)."""
+    solved: list[Array] = []
+    for i, row in enumerate(right):
+
+        def eliminate(row: Array, factored: _Factor, solved: list[Array], i: int = i) -> Array:
+            for k, earlier in enumerate(solved):
+                row = row - _scaled(factored.ratio(i, k), earlier)
+            return row
+
+        solved.append(row if i == 0 else loop(eliminate, row, factored, solved))
+    return solved
+
+
+def backward(factored: _Factor, right: list[Array]) -> list[Array]:
+    """Rows of ``inv(S) @ right`` from what `forward` gave."""
+    solved: list[Array] = []
+    for i in reversed(range(len(right))):
+
+        def substitute(row: Array, factored: _Factor, solved: list[Array], i: int = i) -> Array:
+            row = _scaled(factored.inverses[i], row)
+            for k, later in zip(range(i + 1, len(right)), solved, strict=True):
+                row = row - _scaled(factored.ratio(k, i), later)
+            return row
+
+        solved.insert(0, loop(substitute, right[i], factored, solved))
+    return solved
+
+
+def _scaled(factor: Array, row: Array) -> Array:
+    return factor * row if row.ndim == 1 else factor[None] * row
+
+
+class _Solved(NamedTuple):
+    """What an update and its derivative share; lists are over rows."""
+
+    factored: _Factor
+    projected: list[Array]
+    """Rows of ``H P``, hidden ones zero, (n, lanes)."""
+    gain: list[Array]
+    """Columns of the gain K, (n, lanes)."""
+    residual: list[Array]
+    whitened: list[Array]
+    """Rows of ``inv(L) e``."""
 
 
 def hide(matrix: Array, mask: Array) -> Array:
@@ -153,97 +224,109 @@ def hide(matrix: Array, mask: Array) -> Array:
     return jnp.where(mask[:, None] & mask[None], matrix, eye)
 
 
-def innovation_covariance(p: Pattern, slope: Array | None, noise: Array, cov: Array) -> Any:
-    """``H P`` and ``H P H' + R`` of all rows, hidden ones included."""
+def innovation_covariance(p: Pattern, slope: Array | None, noise: Array, cov: Array) -> Array:
+    """``H P H' + R`` of all rows, hidden ones included."""
     projected = loop(partial(patterned.multiply, p), slope, cov)
-
     spread = loop(lambda s, h: patterned.multiply(p, s, h, axis=1), slope, projected)
-    return projected, symmetric(spread) + (on_diagonal(noise) if noise.ndim == 2 else noise)
+    return spread + (on_diagonal(noise) if noise.ndim == 2 else noise)
 
 
-def invert(matrix: Array) -> tuple[Array, Array]:
-    """Inverse and pivots of small positive definite matrices (m, m, lanes), by sweeping each row.
+def _projected(p: Pattern, i: int, slope: Array | None, cov: Array, mask: Array) -> Array:
+    """Row i of ``H P``, zero where hidden."""
+    row = patterned.row(p, slope, i, cov)
+    return jnp.zeros_like(cov[0]) if row is None else jnp.where(mask[i][None], row, 0.0)
 
-    The pivots are those of Cholesky's factor, squared: their logarithms add up to that of the
-    determinant, and one that is not positive says that the matrix was not definite.
-    """
-    size = matrix.shape[0]
-    index = np.arange(size)
-    pivots = []
 
-    def sweep(k: int, matrix: Array, pivot: Array) -> Array:
-        inverse = 1.0 / pivot
-        column = matrix[:, k]
-        scaled = column * inverse[None]
-        rest = matrix - outer(scaled, column)
-        row, col = (index == k)[:, None, None], (index == k)[None, :, None]
-        crossed = jnp.where(col, scaled[:, None], rest)
-        crossed = jnp.where(row, scaled[None], crossed)
-        return jnp.where(row & col, -inverse[None, None], crossed)
-
-    for k in range(size):
-        pivots.append(matrix[k, k])
-        matrix = loop(partial(sweep, k), matrix, pivots[k])
-    return -matrix, jnp.stack(pivots)
+def _innovation_column(
+    p: Pattern, j: int, slope: Array | None, projected: list[Array], noise: Array, mask: Array
+) -> Array:
+    """Rows j and later of column j of ``H P H' + R``, hidden rows as in the identity."""
+    value = patterned.multiply(p, slope, projected[j])[j:]
+    first = np.arange(mask.shape[0] - j)[:, None] == 0
+    if noise.ndim == 2:
+        value = value + jnp.where(first, noise[j][None], 0.0)
+    else:
+        value = value + noise[j:, j]
+    return jnp.where(mask[j:] & mask[j][None], value, first.astype(value.dtype))
 
 
 def _solve(p: Pattern, gained: Gained, rows: Rows) -> _Solved:
-    mask = rows.mask
-    projected, cov = innovation_covariance(p, rows.slope, rows.noise, gained.cov)
-    projected = jnp.where(mask[:, None], projected, 0.0)
-    inverse, pivots = invert(loop(hide, cov, mask))
-    moved = patterned.multiply(p, rows.slope, gained.delta)
+    mask, slope = rows.mask, rows.slope
+    count = range(mask.shape[0])
+    projected = [loop(partial(_projected, p, i), slope, gained.cov, mask) for i in count]
+    column = partial(_innovation_column, p)
+    factored = factor(len(count), column, slope, projected, rows.noise, mask)
+    moved = patterned.multiply(p, slope, gained.delta)
     residual = jnp.where(mask, rows.residual - moved, 0.0)
-    scaled = loop(apply, inverse, residual)
-    gain = loop(transposed_product, projected, inverse)
-    if rows.noise.ndim == 2:
-        noise = jnp.where(mask, rows.noise, 1.0)
-    else:
-        noise = hide(rows.noise, mask)
-    return _Solved(inverse, pivots, projected, scaled, gain, residual, noise)
+    gain = backward(factored, forward(factored, projected))
+    residuals = [residual[i] for i in count]
+    return _Solved(factored, projected, gain, residuals, forward(factored, residuals))
+
+
+def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
+    """``sum_i left_i right_i'``, rows (n, lanes) to (n, n, lanes)."""
+    return written_sum([outer(a, b) for a, b in zip(left, right, strict=True)])
 
 
 def _take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, _Solved]:
     """The state after a block of rows, their smallest pivot, and what the derivative needs.
 
+    The covariance is symmetric but for rounding; its cotangent must be symmetric.
+
     The covariance is Joseph's ``(I - K H) P (I - K H)' + K R K'``, in the order ``half = P - K (H P)``,
     ``half + (K R - half H') K'``: a gain that is rounded then counts only to the second order.
     """
     solved = _solve(p, gained, rows)
-    mask, noise = rows.mask, solved.noise
+    mask, noise, gain = rows.mask, rows.noise, solved.gain
 
-    def half_way(cov: Array, gain: Array, projected: Array) -> Array:
-        return cov - product(gain, projected)
+    def half_way(cov: Array, gain: list[Array], projected: list[Array]) -> Array:
+        return cov - sum_of_outer(gain, projected)
 
-    def remainder(half: Array, slope: Array | None, gain: Array, noise: Array) -> Array:
-        spread = gain * noise[None] if noise.ndim == 2 else product(gain, noise)
-        missing = spread - patterned.multiply(p, slope, half, axis=1)
-        return jnp.where(mask[None], missing, 0.0)
+    def remainder(half: Array, slope: Array | None, gain: list[Array], i: int) -> Array:
+        if noise.ndim == 2:
+            spread = gain[i] * noise[i][None]
+        else:
+            spread = written_sum([g * noise[k, i][None] for k, g in enumerate(gain)])
+        seen = patterned.row(p, slope, i, half, axis=1)
+        return jnp.where(mask[i][None], spread if seen is None else spread - seen, 0.0)
 
-    def finish(half: Array, rest: Array, gain: Array) -> Array:
-        return half + product_transposed(rest, gain)
+    def finish(half: Array, rest: list[Array], gain: list[Array]) -> Array:
+        return half + sum_of_outer(rest, gain)
 
-    half = loop(half_way, gained.cov, solved.gain, solved.projected)
-    rest = loop(remainder, half, rows.slope, solved.gain, noise)
-    cov = loop(symmetric, loop(finish, half, rest, solved.gain))
-    delta = gained.delta + loop(apply, solved.gain, solved.residual)
-    pivots = [solved.pivots[i] for i in range(mask.shape[0])]
-    log_likelihood = gained.log_likelihood - 0.5 * _surprise(solved, mask)
-    smallest = pivots[0]
-    for pivot in pivots[1:]:
-        smallest = jnp.minimum(smallest, pivot)
+    half = loop(half_way, gained.cov, gain, solved.projected)
+    rest = [
+        loop(partial(remainder, i=i), half, rows.slope, gain) for i in range(mask.shape[0])
+    ]
+    cov = loop(finish, half, rest, gain)
+
+    def move(delta: Array, gain: list[Array], residual: list[Array]) -> Array:
+        return delta + written_sum([g * r[None] for g, r in zip(gain, residual, strict=True)])
+
+    delta = loop(move, gained.delta, gain, solved.residual)
+    log_likelihood = gained.log_likelihood - 0.5 * loop(_surprise, solved, mask)
+    smallest = loop(lambda pivots: reduce(jnp.minimum, pivots), solved.factored.pivots)
     return Gained(cov, delta, log_likelihood), smallest, solved
 
 
 def _surprise(solved: _Solved, mask: Array) -> Array:
     """``e' inv(S) e + log det (2 pi S)`` of the rows that count."""
-    terms = solved.residual * solved.scaled
-    terms = terms + jnp.where(mask, jnp.log(solved.pivots) + _LOG_2PI, 0.0)
-    return written_sum([terms[i] for i in range(terms.shape[0])])
+    factored = solved.factored
+    squares = [w * w * i for w, i in zip(solved.whitened, factored.inverses, strict=True)]
+    # Few logarithms: pivots are multiplied first, few enough that no product over- or underflows.
+    pivots = factored.pivots
+    products = [
+        reduce(operator.mul, pivots[i : i + _PIVOTS_PER_LOG])
+        for i in range(0, len(pivots), _PIVOTS_PER_LOG)
+    ]
+    visible = written_sum([mask[i].astype(squares[0].dtype) for i in range(mask.shape[0])])
+    return written_sum(squares) + written_sum([jnp.log(q) for q in products]) + visible * _LOG_2PI
 
 
 def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
-    """Take a block of rows; also the smallest pivot, positive where all went well."""
+    """Take a block of rows; also the smallest pivot, positive where all went well.
+
+    The covariance is symmetric but for rounding, and `symmetric` is left to the caller.
+    """
     after, smallest, _ = _take(p, gained, rows)
     return after, smallest
 
@@ -251,13 +334,18 @@ def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
 def _update_pullback(
     p: Pattern, saved: tuple[Gained, Rows, _Solved], cotangent: Gained
 ) -> tuple[Gained, Rows]:
-    """Cotangents of what went into `update` from those of what came out; DESIGN's section 6e."""
+    """Cotangents of what went into `update` from those of what came out."""
     after, rows, solved = saved
-    mask, slope = rows.mask, rows.slope
+    mask, slope, factored = rows.mask, rows.slope, solved.factored
+    count = mask.shape[0]
     back, turned = p.transposed, patterned.transpose(slope)
-    b = loop(symmetric, cotangent.cov)
+    b = cotangent.cov
     a, weight = cotangent.delta, cotangent.log_likelihood
-    gain, scaled = solved.gain, solved.scaled
+    gain = jnp.stack(solved.gain, axis=1)
+    scaled = jnp.stack(backward(factored, solved.whitened))
+    eye = np.eye(count)[:, :, None]
+    unit = [jnp.broadcast_to(jnp.asarray(eye[i]), mask.shape) for i in range(count)]
+    inverse = jnp.stack(backward(factored, forward(factored, unit)))
     lowered = loop(lambda gain, a: apply(gain.swapaxes(0, 1), a), gain, a)
     error = lowered - weight[None] * scaled
 
@@ -265,7 +353,7 @@ def _update_pullback(
         whole = (0.5 * weight)[None, None] * (outer(scaled, scaled) - inverse)
         return jnp.where(mask[:, None] & mask[None], whole, 0.0)
 
-    info = loop(information, scaled, solved.inverse, weight)
+    info = loop(information, scaled, inverse, weight)
     turned_b = loop(transposed_product, gain, b)  # K' B
 
     def of_noise(turned_b: Array, gain: Array, lowered: Array, scaled: Array, info: Array) -> Array:
@@ -276,21 +364,19 @@ def _update_pullback(
 
     noise = loop(of_noise, turned_b, gain, lowered, scaled, info)
     noise = jnp.where(mask if noise.ndim == 2 else mask[:, None] & mask[None], noise, 0.0)
-    # A = I - K H;  A' B A = B - H' (K' B) - (B K) H + H' (K' B K) H, taken as two rank-m steps.
-    hb = loop(partial(patterned.multiply, back), turned, turned_b)  # H' K' B
-    first = loop(lambda b, hb: b - hb, b, hb)  # A' B
-    gathered = loop(product, first, gain)  # A' B K
-    drawn = patterned.multiply(back, turned, scaled)  # H' s
-    pulled = a - patterned.multiply(back, turned, lowered)  # A' a
-
-    def of_cov(first: Array, gathered: Array, slope: Any, info: Array, pulled: Array, drawn: Array) -> Array:
-        turned = patterned.transpose(slope)
-        spread = patterned.multiply(back, turned, info)  # H' M
-        both = patterned.multiply(back, turned, spread - gathered, axis=1)
-        return symmetric(first + both + outer(pulled, drawn))
-
-    cov = loop(of_cov, first, gathered, slope, info, pulled, drawn)
-    delta = a - patterned.multiply(back, turned, error)
+    # A = I - K H:  A' B A = A' B - (A' B K) H  with  A' B = B - H' (K' B).
+    hb = loop(partial(patterned.multiply, back), turned, turned_b)
+    first = loop(lambda b, hb: b - hb, b, hb)
+    gathered = loop(product, first, gain)
+    drawn = loop(partial(patterned.multiply, back), turned, scaled)  # H' s
+    pulled = a - loop(partial(patterned.multiply, back), turned, lowered)  # A' a
+    spread = loop(
+        lambda t, info, gathered: patterned.multiply(back, t, info) - gathered, turned, info, gathered
+    )
+    both = loop(lambda t, s: patterned.multiply(back, t, s, axis=1), turned, spread)
+    whole = loop(lambda f, b, p, d: f + b + outer(p, d), first, both, pulled, drawn)
+    cov = loop(symmetric, whole)
+    delta = a - loop(partial(patterned.multiply, back), turned, error)
     slope_bar = None
     if slope is not None:
 

@@ -127,6 +127,22 @@ def multiply(p: Pattern, block: Array | None, x: Array, axis: int = 0) -> Array:
     return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
 
 
+def row(p: Pattern, block: Array | None, index: int, x: Array, axis: int = 0) -> Array | None:
+    """One row of ``matrix @ x`` without the axis contracted; None where the row is known to be zero."""
+    terms = []
+    for col in np.flatnonzero(p.base[index]):
+        part = lax.index_in_dim(x, int(col), axis, keepdims=False)
+        value = p.base[index, col]
+        terms.append(part if value == 1.0 else value * part)
+    if block is not None and index in p.rows:
+        at = p.rows.index(index)
+        for t, col in enumerate(p.cols):
+            part = lax.index_in_dim(x, col, axis, keepdims=False)
+            factor = block[at, t]
+            terms.append(factor.reshape((1,) * (part.ndim - 1) + factor.shape) * part)
+    return written_sum(terms) if terms else None
+
+
 def _one(x: Array, index: int, axis: int) -> Array:
     return lax.slice_in_dim(x, index, index + 1, axis=axis)
 

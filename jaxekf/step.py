@@ -143,7 +143,7 @@ def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
     rows = linear.rows
     if sensor.gate is None:
         return jnp.zeros_like(rows.mask)
-    _, cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
+    cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
     cov = algebra.hide(cov, rows.mask)
     outside: list[Any] = [None] * sensor.rows
     for members in sensor.group_rows:
@@ -228,7 +228,9 @@ def _correct(
     correction = system.correction
     mean, reset = correction.piece(constants, prior.mean, gained.delta, any_used, adjoint=adjoint)
     cov = gained.cov
-    if not correction.reset.is_identity:
+    if correction.reset.is_identity:
+        cov = algebra.symmetric(cov)
+    else:
         cov = _congruence(correction.reset, reset, cov, adjoint)
     return Belief(mean, jnp.where(any_used[None, None], cov, prior.cov))
 

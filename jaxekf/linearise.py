@@ -1,6 +1,6 @@
 """First-order models of a transition and of a measurement, in tangent spaces, for one run."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -36,16 +36,14 @@ def linearise_transition(
 
     predicted = moved(x, still)
 
-    def by_state(delta: Array) -> Array:
-        change = manifold.lift(model.space, x, delta)
-        found = jax.jvp(lambda x: moved(x, still), (x,), (change,))[1]
-        return manifold.lower(model.space, predicted, found)
-
     def by_noise(noise: Array) -> Array:
         found = jax.jvp(lambda w: moved(x, w), (still,), (noise,))[1]
         return manifold.lower(model.space, predicted, found)
 
-    f = _columns(by_state, model.error_dim, dtype, model.error_dim, state_columns)
+    f = _by_parts(
+        model, lambda x: moved(x, still), x, lambda change: manifold.lower(model.space, predicted, change),
+        model.error_dim, state_columns,
+    )  # fmt: skip
     return predicted, f, _columns(by_noise, size, dtype, model.error_dim, noise_columns)
 
 
@@ -65,17 +63,46 @@ def linearise_sensor(
     """
     expected = sensor.predict(x, u, params, rows.aux)
 
-    def error(delta: Array) -> Array:
-        def moved(x: Any) -> Any:
-            return sensor.predict(x, u, params, rows.aux)
+    def predict(x: Any) -> Any:
+        return sensor.predict(x, u, params, rows.aux)
 
-        change = jax.jvp(moved, (x,), (manifold.lift(model.space, x, delta),))[1]
+    def lower(change: Any) -> Array:
         return manifold.lower(sensor.space, expected, change)
 
-    jacobian = _columns(error, model.error_dim, manifold.dtype_of(x), sensor.rows, columns)
+    jacobian = _by_parts(model, predict, x, lower, sensor.rows, columns)
     value = _neutral(sensor.space, rows.value, rows.mask, expected)
     residual = jnp.where(rows.mask, manifold.local(sensor.space, expected, value), 0.0)
     return residual, jacobian, sensor.noise(params, rows.aux, rows.dt)
+
+
+def _by_parts(
+    model: Model,
+    function: Callable[[Any], Any],
+    x: Any,
+    lower: Callable[[Any], Array],
+    rows: int,
+    columns: Sequence[int] | None,
+) -> Array:
+    """The Jacobian of a function of the state, its columns part by part of the state.
+
+    A part is differentiated with the others held, so that their derivatives need no arithmetic.
+    """
+    leaves, structure = jax.tree.flatten(x)
+    dtype = manifold.dtype_of(x)
+    found = []
+    for i, part in enumerate(manifold.parts(model.space)):
+        chosen = [c - part.error.start for c in columns or () if c in range(model.error_dim)[part.error]]
+
+        def derivative(delta: Array, i: int = i, part: manifold.Part = part) -> Array:
+            def moved(leaf: Array) -> Any:
+                return function(jax.tree.unflatten(structure, [*leaves[:i], leaf, *leaves[i + 1 :]]))
+
+            change = part.manifold.lift(leaves[i], delta)
+            return lower(jax.jvp(moved, (leaves[i],), (change,))[1])
+
+        wanted = None if columns is None else chosen
+        found.append(_columns(derivative, part.manifold.dim, dtype, rows, wanted))
+    return jnp.concatenate(found, axis=1)
 
 
 def _columns(

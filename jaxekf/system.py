@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import lanes, linearise, manifold, patterned, programs, structure
+from jaxekf import lanes, linearise, manifold, patterned, programs, scalars, structure
 from jaxekf.model import Model, Sensor
 from jaxekf.patterned import Pattern
 from jaxekf.programs import Program
@@ -49,7 +49,7 @@ class Piece:
         inexact = [jnp.issubdtype(spec.dtype, jnp.inexact) for spec in self._body.inputs]
         if self._pullback is None:
             self._pullback = _pullback(self._body, inexact)
-        found = lanes.evaluate(self._pullback, [*values, *cotangents], values[0].shape[-1])
+        found = scalars.evaluate(self._pullback, [*values, *cotangents])
         found = iter(found)
         return tuple(
             next(found) if flag else np.zeros(value.shape, jax.dtypes.float0)
@@ -58,7 +58,7 @@ class Piece:
 
 
 def _on_lanes(body: Program, *values: Array) -> list[Array]:
-    return jax.tree.leaves(lanes.evaluate(body, values, values[0].shape[-1]))
+    return jax.tree.leaves(scalars.evaluate(body, values))
 
 
 def _pullback(body: Program, inexact: list[bool]) -> Program:

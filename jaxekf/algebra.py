@@ -364,18 +364,17 @@ def _update_pullback(
 
     noise = loop(of_noise, turned_b, gain, lowered, scaled, info)
     noise = jnp.where(mask if noise.ndim == 2 else mask[:, None] & mask[None], noise, 0.0)
-    # A = I - K H:  A' B A = A' B - (A' B K) H  with  A' B = B - H' (K' B).
-    hb = loop(partial(patterned.multiply, back), turned, turned_b)
-    first = loop(lambda b, hb: b - hb, b, hb)
-    gathered = loop(product, first, gain)
-    drawn = loop(partial(patterned.multiply, back), turned, scaled)  # H' s
     pulled = a - loop(partial(patterned.multiply, back), turned, lowered)  # A' a
-    spread = loop(
-        lambda t, info, gathered: patterned.multiply(back, t, info) - gathered, turned, info, gathered
-    )
-    both = loop(lambda t, s: patterned.multiply(back, t, s, axis=1), turned, spread)
-    whole = loop(lambda f, b, p, d: f + b + outer(p, d), first, both, pulled, drawn)
-    cov = loop(symmetric, whole)
+
+    # With N = K' B K + M the whole is B - H' T - T' H,  T = K' B - N H / 2 - s (A' a)' / 2.
+    def half(slope: Array | None, inner: Array, turned_b: Array, scaled: Array, pulled: Array) -> Array:
+        drawn = patterned.multiply(p.transposed, patterned.transpose(slope), inner, axis=1)
+        return turned_b - 0.5 * (drawn + outer(scaled, pulled))
+
+    inner = loop(lambda turned_b, gain, info: product(turned_b, gain) + info, turned_b, gain, info)
+    spread = loop(half, slope, inner, turned_b, scaled, pulled)
+    whole = loop(partial(patterned.multiply, back), turned, spread)
+    cov = loop(lambda b, w: b - w - w.swapaxes(0, 1), b, whole)
     delta = a - loop(partial(patterned.multiply, back), turned, error)
     slope_bar = None
     if slope is not None:

@@ -90,7 +90,7 @@ def run_filter(
     *,
     keep: Keep = "everything",
     adjoint: bool = True,
-    checkpoint: bool | None = None,
+    checkpoint: bool = True,
 ) -> FilterOutput:
     """Filter one run from an initial belief; differentiable in everything, and fast under `vmap`.
 
@@ -98,8 +98,8 @@ def run_filter(
     ``means``, besides log-likelihoods; what is not kept costs neither time nor memory. Reverse
     derivatives are taken by the closed-form adjoint, several times faster than JAX's own; it has no
     forward mode (forward over reverse is fine). With ``adjoint=False`` all derivatives are JAX's own.
-    `checkpoint` keeps fewer beliefs for the reverse pass and computes the others again; None does so
-    where they would need more than a quarter of a gigabyte.
+    For the reverse pass a few beliefs are kept and the others computed again, unless `checkpoint` is
+    False, which keeps all.
 
     Raises `ModelError` for an unknown `keep`, and where forward mode meets the adjoint.
     """
@@ -116,7 +116,7 @@ def run_filter_batch(
     *,
     keep: Keep = "everything",
     adjoint: bool = True,
-    checkpoint: bool | None = None,
+    checkpoint: bool = True,
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
 
@@ -141,13 +141,12 @@ def run_filter_batch(
         kept_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
         lanes = min(runs, recursion.LANES)
         segment = recursion.segment_length(epochs, kept_bytes * lanes)
-        if checkpoint is not None:
-            segment = recursion.segment_length(epochs, 1, 0) if checkpoint else 1
+        if not checkpoint:
+            segment = 1
         moving = reverse_only((prepared, belief, given))
         kept = recursion.filter_with_adjoint(ready, what, segment, *moving)
     else:
-        again = checkpoint is not False
-        kept = recursion.filter_plainly(ready, what, again, prepared, belief, given)
+        kept = recursion.filter_plainly(ready, what, checkpoint, prepared, belief, given)
     updated = Belief(kept.mean, kept.cov)
     instants = Instant(kept.prior, updated, kept.log_likelihood, kept.healthy)
     innovations = _innovations(model, params, inputs, steps, kept) if what.used else {}

@@ -25,6 +25,9 @@ from jaxekf.system import System
 LANES = 16
 """Runs in a block: wide enough to fill vector registers, small enough to stay in the first cache."""
 _LARGEST_UNROLLED_SUBSTEPS = 2
+_CACHE_BYTES = 1 << 21
+_MEMORY_BYTES = 1 << 32
+_SEGMENT = 16
 
 
 class Given(NamedTuple):
@@ -164,8 +167,8 @@ def _scan_back(
     segment: int,
     moving: tuple[bool, ...],
     live: tuple[bool, ...],
-    prepared: Any,
     starts: Belief,
+    prepared: Any,
     given: Given,
     cotangents: list[Array],
 ) -> tuple[Any, Belief, list[Array]]:
@@ -236,44 +239,116 @@ def _merge(flags: Any, chosen: list[Any], others: list[Any]) -> list[Any]:
 # --- all runs -----------------------------------------------------------------------------------------
 
 
-def _in_blocks(function: Callable[..., Any], *trees: Any) -> Any:
-    """``function`` of trees with lanes last, for runs on the first axis in blocks of `LANES`."""
-    runs = jax.tree.leaves(trees)[0].shape[0]
-    size = runs if runs <= LANES else LANES
-    count = -(-runs // size)
+class Blocks(NamedTuple):
+    """Arrays as the scans leave them: (blocks, ..., lanes), the last block filled up.
+
+    They stay so from the forward to the backward pass; to put the runs first and back would cost as
+    much as the filter. `runs` (runs, 0) says which runs they are.
+    """
+
+    arrays: Any
+    runs: Array
+
+
+def _lanes(runs: int) -> tuple[int, int]:
+    """Number of blocks and their width."""
+    size = min(runs, LANES)
+    return -(-runs // size), size
+
+
+def _cut_runs(tree: Any) -> Any:
+    """Arrays (runs, ...) as (blocks, lanes, ...), the last run repeated to fill the last block."""
 
     def cut(a: Array) -> Array:
-        more = count * size - runs
+        count, size = _lanes(a.shape[0])
+        more = count * size - a.shape[0]
         if more:
             a = jnp.concatenate([a, jnp.broadcast_to(a[-1:], (more, *a.shape[1:]))])
         return a.reshape(count, size, *a.shape[1:])
 
-    def one(trees: Any) -> Any:
-        lanes_last = jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), trees)
-        return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), function(*lanes_last))
+    return jax.tree.map(cut, tree)
 
-    if count == 1:
-        return one(trees)
-    found = lax.map(one, jax.tree.map(cut, trees))
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:runs], found)
+
+def _join_runs(tree: Any, runs: int) -> Any:
+    """The inverse of `_cut_runs`."""
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:runs], tree)
+
+
+def _lanes_last(tree: Any) -> Any:
+    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), tree)
+
+
+def _lanes_first(tree: Any) -> Any:
+    return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), tree)
+
+
+def _in_blocks(function: Callable[..., Any], blocked: Any, *trees: Any) -> Any:
+    """``function`` of trees with lanes last, for runs on the first axis in blocks of `LANES`.
+
+    It is called with `blocked`, which is in blocks already, and `trees`; of its two results the first is
+    put back to runs, the second is left in blocks.
+    """
+    runs = jax.tree.leaves(trees)[0].shape[0]
+
+    def one(given: Any) -> Any:
+        blocked, trees = given
+        first, second = function(blocked, *_lanes_last(trees))
+        return _lanes_first(first), second
+
+    given = (blocked, _cut_runs(trees))
+    if _lanes(runs)[0] == 1:
+        found = one(jax.tree.map(lambda a: a[0], given))
+        first, second = jax.tree.map(lambda a: a[None], found)
+    else:
+        first, second = lax.map(one, given)
+    return _join_runs(first, runs), second
 
 
 def _over_more_runs(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of runs on the first axis, whose `vmap` is the same function of more runs."""
+    """A function of runs on the first axis, whose `vmap` is the same function of more runs.
+
+    It is called with None or `Blocks` and with trees; it returns a tree and None or `Blocks`.
+    """
     mapped = custom_vmap(function)
 
     @mapped.def_vmap
-    def _(size: int, batched: Any, *args: Any) -> Any:
+    def _(size: int, batched: Any, blocks: Blocks | None, *trees: Any) -> Any:
         def merge(flag: bool, a: Array) -> Array:
             if not flag:
                 a = jnp.broadcast_to(a, (size, *a.shape))
             return a.reshape(-1, *a.shape[2:])
 
-        found = mapped(*jax.tree.map(merge, tuple(batched), tuple(args)))
+        merged = jax.tree.map(merge, tuple(batched[1:]), trees)
+        if blocks is not None:
+            blocks = _merge_blocks(size, batched[0], blocks)
+        found, left = mapped(blocks, *merged)
         found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
-        return found, jax.tree.map(lambda _: True, found)
+        flags = jax.tree.map(lambda _: True, found)
+        if left is None:
+            return (found, None), (flags, None)
+        runs = left.runs.reshape(size, -1, 0)
+        unbatched = jax.tree.map(lambda _: False, left.arrays)
+        return (found, Blocks(left.arrays, runs)), (flags, Blocks(unbatched, True))
 
     return mapped
+
+
+def _merge_blocks(size: int, batched: Blocks, blocks: Blocks) -> Blocks:
+    """Blocks of all runs of a `vmap` of the given size."""
+    runs = blocks.runs.reshape(-1, 0) if batched.runs else jnp.tile(blocks.runs, (size, 1))
+    if batched.runs and not any(jax.tree.leaves(batched.arrays)):
+        # Made under the same `vmap`: the blocks hold the runs of all its members already.
+        return Blocks(blocks.arrays, runs)
+    count = runs.shape[0] // size
+
+    def merge(flag: bool, a: Array) -> Array:
+        def spread(a: Array) -> Array:
+            return _join_runs(jnp.moveaxis(a, -1, 1), count)
+
+        a = jax.vmap(spread)(a) if flag else jnp.broadcast_to(spread(a), (size, count, *a.shape[1:-1]))
+        return jnp.moveaxis(_cut_runs(a.reshape(-1, *a.shape[2:])), 1, -1)
+
+    return Blocks(jax.tree.map(merge, batched.arrays, blocks.arrays), runs)
 
 
 def _whole(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -286,13 +361,13 @@ def filter_plainly(
 ) -> Kept:
     """The recursion with JAX's own derivatives, forward and reverse."""
 
-    def runs(prepared: Any, belief: Belief, given: Given) -> Kept:
+    def runs(_: None, prepared: Any, belief: Belief, given: Given) -> tuple[Kept, None]:
         epoch = partial(_epoch, system, what, False, prepared)
         if checkpoint:
             epoch = jax.checkpoint(epoch)
-        return lax.scan(epoch, belief, given)[1]
+        return lax.scan(epoch, belief, given)[1], None
 
-    return _in_blocks(runs, prepared, belief, given)
+    return _in_blocks(runs, None, prepared, belief, given)[0]
 
 
 def filter_with_adjoint(
@@ -304,16 +379,21 @@ def filter_with_adjoint(
 
 @lru_cache(maxsize=64)
 def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kept]:
-    def run(segment: int | None, *trees: Any) -> Any:
-        scan = partial(_scan, system, what, False, segment)
-        return _in_blocks(_whole(system, scan), *trees)
+    def run(segment: int | None, _: None, *trees: Any) -> Any:
+        def scan(_: None, *trees: Any) -> Any:
+            return _scan(system, what, False, segment, *trees)
 
-    ahead = _over_more_runs(lambda *trees: run(None, *trees)[0])
+        kept, starts = _in_blocks(_whole(system, scan), None, *trees)
+        if segment is None:
+            return kept, None
+        return kept, Blocks(starts, jnp.zeros((jax.tree.leaves(trees)[0].shape[0], 0)))
+
+    ahead = _over_more_runs(partial(run, None))
     ahead_saving = _over_more_runs(partial(run, segment))
 
     @jax.custom_vjp
     def function(prepared: Any, belief: Belief, given: Given) -> Kept:
-        return ahead(prepared, belief, given)
+        return ahead(None, prepared, belief, given)[0]
 
     def forward(prepared: Any, belief: Belief, given: Given) -> Any:
         flags = tuple(
@@ -321,7 +401,7 @@ def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kep
             for leaf in jax.tree.leaves(given)
         )
         values = jax.tree.map(lambda leaf: leaf.value, (prepared, belief, given))
-        kept, starts = ahead_saving(*values)
+        kept, starts = ahead_saving(None, *values)
         return kept, (values[0], starts, values[2], _Flags(flags))
 
     def backward(saved: Any, cotangents: Any) -> Any:
@@ -331,9 +411,8 @@ def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kep
             not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
         )
         chosen = [c for flag, c in zip(live, every, strict=True) if flag]
-        total, first, of_given = _backward(system, what, segment, flags.given, live)(
-            prepared, starts, given, chosen
-        )
+        back = _backward(system, what, segment, flags.given, live)
+        total, first, of_given = back(starts, prepared, given, chosen)[0]
         return _unfilled(prepared, None, total), first, _unfilled(given, flags.given, of_given)
 
     function.defvjp(forward, backward, symbolic_zeros=True)
@@ -344,8 +423,13 @@ def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kep
 def _backward(
     system: System, what: What, segment: int, moving: tuple[bool, ...], live: tuple[bool, ...]
 ) -> Callable[..., Any]:
-    scan = partial(_scan_back, system, what, segment, moving, live)
-    return _over_more_runs(partial(_in_blocks, _whole(system, scan)))
+    def scan(starts: Belief, *trees: Any) -> Any:
+        return _scan_back(system, what, segment, moving, live, starts, *trees), None
+
+    def run(starts: Blocks, *trees: Any) -> Any:
+        return _in_blocks(_whole(system, scan), starts.arrays, *trees)
+
+    return _over_more_runs(run)
 
 
 def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:
@@ -361,6 +445,12 @@ def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:
     return jax.tree.unflatten(structure, merged)
 
 
-def segment_length(epochs: int, bytes_per_epoch: int, budget: int = 1 << 28) -> int:
-    """Epochs between kept beliefs: 1 while all fit into the budget, else about the square root."""
-    return 1 if epochs * bytes_per_epoch <= budget else max(1, math.isqrt(epochs))
+def segment_length(epochs: int, bytes_per_epoch: int) -> int:
+    """Epochs between kept beliefs.
+
+    All are kept while they fit into the second cache. Beyond it to compute them again, a few at a time,
+    is quicker than to write and read them; with very many epochs it also bounds the memory.
+    """
+    if epochs * bytes_per_epoch <= _CACHE_BYTES:
+        return 1
+    return max(_SEGMENT, math.isqrt(epochs) if epochs * bytes_per_epoch > _MEMORY_BYTES else 0)

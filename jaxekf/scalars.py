@@ -8,7 +8,6 @@ numbers that are used often being kept and the others made where they are used.
 
 import functools
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -40,6 +39,23 @@ class _Node:
 
 def evaluate(program: Program, values: Sequence[Array]) -> Any:
     """The outputs of `program`, with lanes; each of `values` carries the lanes on its last axis."""
+    outputs, sources = _graph(program, values)
+    return jax.tree.unflatten(program.tree, _compute(outputs, sources, values[0].shape[-1]))
+
+
+def used(program: Program, count: int) -> list[list[tuple[int, ...]]]:
+    """Which numbers of each of the first `count` inputs the outputs depend on."""
+    blank = [jnp.zeros((*spec.shape, 1), spec.dtype) for spec in program.inputs]
+    outputs, _ = _graph(program, blank)
+    found: list[set[Any]] = [set() for _ in range(count)]
+    for node in _order(outputs)[0]:
+        if node.operation is None and node.inputs[0] < count:
+            found[node.inputs[0]].add(node.inputs[1])
+    return [sorted(indices) for indices in found]
+
+
+def _graph(program: Program, values: Sequence[Array]) -> tuple[list[Numbers], list[Array]]:
+    """The numbers of the outputs, and the arrays that they are computed from."""
     width = values[0].shape[-1]
     sources = list(values)
     made: dict[Any, _Node] = {}
@@ -59,8 +75,7 @@ def evaluate(program: Program, values: Sequence[Array]) -> Any:
         operands = [read(i) for i in operation.inputs]
         found = _apply(operation, operands, made, sources)
         known.update(zip(operation.outputs, found, strict=True))
-    outputs = [read(o) for o in program.outputs]
-    return jax.tree.unflatten(program.tree, _compute(outputs, sources, width))
+    return [read(o) for o in program.outputs], sources
 
 
 def _compute(outputs: list[Numbers], sources: list[Array], width: int) -> list[Array]:

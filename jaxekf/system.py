@@ -24,7 +24,10 @@ class Piece:
 
     def __init__(self, function: Callable[..., Any], params: Any, *rest: Any) -> None:
         program = programs.trace(function, params, *rest)
-        self._head, self._body = programs.split(program, len(jax.tree.leaves(params)))
+        self._head, body = programs.split(program, len(jax.tree.leaves(params)))
+        count = len(self._head.outputs)
+        self._used = scalars.used(body, count)
+        self._body = _compact(body, count, self._used)
         self._on_lanes = partial(_on_lanes, self._body)
         self._pullback: Program | None = None
         self._with_adjoint = jax.custom_vjp(self._on_lanes)
@@ -32,7 +35,12 @@ class Piece:
 
     def prepare(self, params: Any) -> tuple[Array, ...]:
         """What the steps need of the parameters, for one run; differentiable and cheap."""
-        return tuple(self._head.evaluate(jax.tree.leaves(params)))
+        values = self._head.evaluate(jax.tree.leaves(params))
+        return tuple(
+            jnp.stack([value[index] for index in used])
+            for value, used in zip(values, self._used, strict=True)
+            if used
+        )
 
     @property
     def is_plain(self) -> bool:
@@ -55,6 +63,28 @@ class Piece:
             next(found) if flag else np.zeros(value.shape, jax.dtypes.float0)
             for flag, value in zip(inexact, values, strict=True)
         )
+
+
+def _compact(body: Program, count: int, used: list[list[tuple[int, ...]]]) -> Program:
+    """The body with only the numbers that are used in place of each of its first `count` inputs."""
+    specs = [
+        jax.ShapeDtypeStruct((len(indices),), spec.dtype)
+        for spec, indices in zip(body.inputs[:count], used, strict=True)
+        if indices
+    ]
+
+    def function(*values: Any) -> Any:
+        given = iter(values)
+        full = []
+        for spec, indices in zip(body.inputs[:count], used, strict=True):
+            known = next(given) if indices else None
+            numbers = [jnp.zeros((), spec.dtype)] * int(np.prod(spec.shape, dtype=int))
+            for at, index in enumerate(indices):
+                numbers[int(np.ravel_multi_index(index, spec.shape)) if index else 0] = known[at]
+            full.append(jnp.stack(numbers).reshape(spec.shape))
+        return body.evaluate([*full, *given])
+
+    return programs.trace(function, *specs, *body.inputs[count:])
 
 
 def _on_lanes(body: Program, *values: Array) -> list[Array]:

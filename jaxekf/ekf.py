@@ -6,7 +6,7 @@ in Joseph's form, which keeps the covariance definite. A model is written for on
 over many, see `jaxekf.recursion`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -117,10 +117,13 @@ def run_filter_batch(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
+    devices: Sequence[jax.Device] = (),
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
 
-    Equal to `vmap` of `run_filter`, and to calls of it one by one; options as there.
+    Equal to `vmap` of `run_filter`, and to calls of it one by one; options as there. With several
+    `devices` the runs are shared among them; CPU cores are devices where JAX's `jax_num_cpu_devices`
+    was set before its first use.
     """
     if keep not in _KEPT:
         raise ModelError(
@@ -144,7 +147,7 @@ def run_filter_batch(
         if not checkpoint:
             segment = 1
         moving = reverse_only((prepared, belief, given))
-        kept = recursion.filter_with_adjoint(ready, what, segment, *moving)
+        kept = recursion.filter_with_adjoint(ready, what, segment, tuple(devices), *moving)
     else:
         kept = recursion.filter_plainly(ready, what, checkpoint, prepared, belief, given)
     updated = Belief(kept.mean, kept.cov)

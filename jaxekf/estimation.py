@@ -21,6 +21,7 @@ from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.timeline import Steps, Timeline
 
 Run = Recording | Path | str
+_BATCH_BYTES = 1 << 30
 
 
 def require_float64() -> None:
@@ -63,37 +64,52 @@ def estimate_many(
 def filter_timelines(
     model: Model, params: Parameters, firsts: Sequence[dict[str, Any]], lines: Sequence[Timeline]
 ) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
-    """Filter runs in one compiled call, padded to a common length out of a few, and check it."""
-    steps = bucketed(lines)
-    means = [model.initial_mean(first) for first in firsts]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
-    output, outputs = _run(model, params, stacked, steps)
-    output, outputs = jax.tree.map(np.asarray, (output, outputs))
-    results = []
-    for i, line in enumerate(lines):
-        one = jax.tree.map(lambda a, i=i: a[i], (output, outputs))
-        results.append(one)
-        _check(model, line, one[0])
-    return results
+    """Filter runs side by side, and check each.
+
+    Runs of like length are padded to a common one out of a few, so that few programs are compiled; more
+    of them than fit into memory are taken one batch after the other.
+    """
+    results: dict[int, Any] = {}
+    for members in padding.groups(lines):
+        group = [lines[i] for i in members]
+        steps = padding.bucketed(group)
+        means = [model.initial_mean(firsts[i]) for i in members]
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *means)
+        size = min(len(members), _batch(model, steps))
+        for start in range(0, len(members), size):
+            # The last batch is filled with the last run: another size would be another program.
+            index = np.minimum(np.arange(start, start + size), len(members) - 1)
+            given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (stacked, steps))
+            found = jax.tree.map(np.asarray, _run(model, sharing_devices(), params, *given))
+            for place in range(min(size, len(members) - start)):
+                one = jax.tree.map(lambda a, place=place: a[place], found)
+                _check(model, lines[members[start + place]], one[0])
+                results[members[start + place]] = one
+    return [results[i] for i in range(len(lines))]
 
 
-def bucketed(lines: Sequence[Timeline]) -> Steps:
-    """Stacked steps, padded to one of a few lengths so that few programs are ever compiled."""
-    steps = padding.stack(list(lines))
-    runs, epochs, substeps = steps.dt.shape
-    longer = padding.bucket(epochs)
-    knots = None if steps.knots is None else padding.bucket(steps.knots.time.shape[1])
-    ones = [jax.tree.map(lambda a, i=i: a[i], steps) for i in range(runs)]
-    padded = [padding.pad(one, longer, substeps, knots) for one in ones]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+def _batch(model: Model, steps: Steps) -> int:
+    """Number of runs to take at once."""
+    _, epochs, substeps = steps.dt.shape
+    size = 8 * epochs * substeps * 4 * model.error_dim * (model.error_dim + 4)
+    return max(1, _BATCH_BYTES // size)
 
 
-@partial(jax.jit, static_argnums=0)
-def _run(model: Model, params: Parameters, means: Any, steps: Steps) -> Any:
+def sharing_devices() -> tuple[Any, ...]:
+    """The CPU devices to share runs among; none where there is one only."""
+    devices = jax.local_devices()
+    shared = len(devices) > 1 and devices[0].platform == "cpu"
+    return tuple(devices) if shared else ()
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _run(
+    model: Model, devices: tuple[Any, ...], params: Parameters, means: Any, steps: Steps
+) -> Any:
     runs = steps.dt.shape[0]
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
     cov = jax.vmap(model.initial_covariance)(every)
-    output = ekf.run_filter_batch(model, every, Belief(means, cov), steps)
+    output = ekf.run_filter_batch(model, every, Belief(means, cov), steps, devices=devices)
     return output, evaluate_outputs(model, every, output)
 
 

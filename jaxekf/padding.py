@@ -1,5 +1,6 @@
 """Runs of unequal length as one array: padding that is inert, in a few sizes for few compilations."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,18 +10,41 @@ from jaxekf.errors import ModelError
 from jaxekf.timeline import Knots, Rows, Steps, Timeline
 
 
-def stack(timelines: list[Timeline]) -> Steps:
-    """The steps of several runs on a new leading axis, the shorter ones padded by inert steps."""
+def stack(timelines: Sequence[Timeline], epochs: int = 0, knots: int = 0) -> Steps:
+    """The steps of several runs on a new leading axis, the shorter ones padded by inert steps.
+
+    They come out with at least `epochs` epochs and `knots` knots of the input.
+    """
     if not timelines:
         raise ModelError("got no run to stack, expected at least one; name some recordings")
     all_steps = [timeline.steps for timeline in timelines]
-    epochs = max(steps.dt.shape[0] for steps in all_steps)
+    epochs = max(epochs, *(steps.dt.shape[0] for steps in all_steps))
     substeps = max(steps.dt.shape[1] for steps in all_steps)
-    padded = [pad(steps, epochs, substeps) for steps in all_steps]
-    knots = [len(steps.knots.time) for steps in padded if steps.knots is not None]
-    if knots:
-        padded = [s._replace(knots=_pad_knots(s.knots, max(knots))) for s in padded]
+    knots = max(knots, *(_knot_count(steps) for steps in all_steps))
+    padded = [pad(steps, epochs, substeps, knots) for steps in all_steps]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
+
+
+def bucketed(timelines: Sequence[Timeline]) -> Steps:
+    """Stacked steps, padded to one of a few lengths so that few programs are ever compiled."""
+    if not timelines:
+        return stack(timelines)
+    epochs = max(line.steps.dt.shape[0] for line in timelines)
+    knots = max(_knot_count(line.steps) for line in timelines)
+    return stack(timelines, bucket(epochs), bucket(knots))
+
+
+def groups(timelines: Sequence[Timeline]) -> list[list[int]]:
+    """The runs that are padded to one length together, as places in the sequence, shortest first."""
+    found: dict[tuple[int, int], list[int]] = {}
+    for i, line in enumerate(timelines):
+        epochs, substeps = line.steps.dt.shape
+        found.setdefault((bucket(epochs), substeps), []).append(i)
+    return [found[key] for key in sorted(found)]
+
+
+def _knot_count(steps: Steps) -> int:
+    return 0 if steps.knots is None else len(steps.knots.time)
 
 
 def bucket(count: int) -> int:
@@ -56,7 +80,7 @@ def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> S
         widen(steps.time, None, 2),
         widen(steps.dt, 0.0, 2),
         widen(steps.valid, False, 2),
-        steps.knots if knots is None else _pad_knots(steps.knots, knots),
+        _pad_knots(steps.knots, knots or 0),
         {name: rows(sensor, 2) for name, sensor in steps.fast.items()},
         {name: rows(sensor, 1) for name, sensor in steps.slow.items()},
     )
@@ -64,7 +88,7 @@ def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> S
 
 def _pad_knots(knots: Knots | None, count: int) -> Knots | None:
     """Knots up to `count`, held at the last value for a second each: never reached by a real step."""
-    if knots is None or len(knots.time) == count:
+    if knots is None or len(knots.time) >= count:
         return knots
     more = np.arange(1.0, count - len(knots.time) + 1.0)
     value = np.repeat(knots.value[-1:], len(more), axis=0)

@@ -250,17 +250,27 @@ class Blocks(NamedTuple):
     runs: Array
 
 
-def _lanes(runs: int) -> tuple[int, int]:
-    """Number of blocks and their width."""
+Devices = tuple[Any, ...]
+"""Devices that share the runs; none for the one that JAX chooses."""
+
+
+def _blocks(runs: int, devices: Devices) -> tuple[int, int]:
+    """Number of blocks, the same for each device, and their width."""
     size = min(runs, LANES)
-    return -(-runs // size), size
+    count = -(-runs // size)
+    return count + -count % max(_shared(count, devices), 1), size
 
 
-def _cut_runs(tree: Any) -> Any:
-    """Arrays (runs, ...) as (blocks, lanes, ...), the last run repeated to fill the last block."""
+def _shared(count: int, devices: Devices) -> int:
+    """How many of the devices share `count` blocks; 0 where there is nothing to share."""
+    return min(count, len(devices)) if count > 1 and len(devices) > 1 else 0
+
+
+def _cut_runs(tree: Any, devices: Devices) -> Any:
+    """Arrays (runs, ...) as (blocks, lanes, ...), the last run repeated to fill the last blocks."""
 
     def cut(a: Array) -> Array:
-        count, size = _lanes(a.shape[0])
+        count, size = _blocks(a.shape[0], devices)
         more = count * size - a.shape[0]
         if more:
             a = jnp.concatenate([a, jnp.broadcast_to(a[-1:], (more, *a.shape[1:]))])
@@ -282,7 +292,9 @@ def _lanes_first(tree: Any) -> Any:
     return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), tree)
 
 
-def _in_blocks(function: Callable[..., Any], blocked: Any, *trees: Any) -> Any:
+def _in_blocks(
+    devices: Devices, function: Callable[..., Any], blocked: Any, *trees: Any
+) -> tuple[Any, Any]:
     """``function`` of trees with lanes last, for runs on the first axis in blocks of `LANES`.
 
     It is called with `blocked`, which is in blocks already, and `trees`; of its two results the first is
@@ -295,16 +307,25 @@ def _in_blocks(function: Callable[..., Any], blocked: Any, *trees: Any) -> Any:
         first, second = function(blocked, *_lanes_last(trees))
         return _lanes_first(first), second
 
-    given = (blocked, _cut_runs(trees))
-    if _lanes(runs)[0] == 1:
+    given = (blocked, _cut_runs(trees, devices))
+    count = _blocks(runs, devices)[0]
+    shared = _shared(count, devices)
+    if count == 1:
         found = one(jax.tree.map(lambda a: a[0], given))
         first, second = jax.tree.map(lambda a: a[None], found)
+    elif shared:
+        mesh = jax.sharding.Mesh(np.array(devices[:shared]), ("runs",))
+        along = jax.sharding.PartitionSpec("runs")
+        split = jax.shard_map(
+            partial(lax.map, one), mesh=mesh, in_specs=along, out_specs=along, check_vma=False
+        )
+        first, second = split(given)
     else:
         first, second = lax.map(one, given)
     return _join_runs(first, runs), second
 
 
-def _over_more_runs(function: Callable[..., Any]) -> Callable[..., Any]:
+def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of runs on the first axis, whose `vmap` is the same function of more runs.
 
     It is called with None or `Blocks` and with trees; it returns a tree and None or `Blocks`.
@@ -320,7 +341,7 @@ def _over_more_runs(function: Callable[..., Any]) -> Callable[..., Any]:
 
         merged = jax.tree.map(merge, tuple(batched[1:]), trees)
         if blocks is not None:
-            blocks = _merge_blocks(size, batched[0], blocks)
+            blocks = _merge_blocks(devices, size, batched[0], blocks)
         found, left = mapped(blocks, *merged)
         found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
         flags = jax.tree.map(lambda _: True, found)
@@ -333,7 +354,7 @@ def _over_more_runs(function: Callable[..., Any]) -> Callable[..., Any]:
     return mapped
 
 
-def _merge_blocks(size: int, batched: Blocks, blocks: Blocks) -> Blocks:
+def _merge_blocks(devices: Devices, size: int, batched: Blocks, blocks: Blocks) -> Blocks:
     """Blocks of all runs of a `vmap` of the given size."""
     runs = blocks.runs.reshape(-1, 0) if batched.runs else jnp.tile(blocks.runs, (size, 1))
     if batched.runs and not any(jax.tree.leaves(batched.arrays)):
@@ -346,7 +367,7 @@ def _merge_blocks(size: int, batched: Blocks, blocks: Blocks) -> Blocks:
             return _join_runs(jnp.moveaxis(a, -1, 1), count)
 
         a = jax.vmap(spread)(a) if flag else jnp.broadcast_to(spread(a), (size, count, *a.shape[1:-1]))
-        return jnp.moveaxis(_cut_runs(a.reshape(-1, *a.shape[2:])), 1, -1)
+        return jnp.moveaxis(_cut_runs(a.reshape(-1, *a.shape[2:]), devices), 1, -1)
 
     return Blocks(jax.tree.map(merge, batched.arrays, blocks.arrays), runs)
 
@@ -367,29 +388,37 @@ def filter_plainly(
             epoch = jax.checkpoint(epoch)
         return lax.scan(epoch, belief, given)[1], None
 
-    return _in_blocks(runs, None, prepared, belief, given)[0]
+    return _in_blocks((), runs, None, prepared, belief, given)[0]
 
 
 def filter_with_adjoint(
-    system: System, what: What, segment: int, prepared: Any, belief: Belief, given: Given
+    system: System,
+    what: What,
+    segment: int,
+    devices: Devices,
+    prepared: Any,
+    belief: Belief,
+    given: Given,
 ) -> Kept:
     """The recursion with its reverse derivative by the adjoint; `segment` epochs between kept beliefs."""
-    return _with_adjoint(system, what, segment)(prepared, belief, given)
+    return _with_adjoint(system, what, segment, devices)(prepared, belief, given)
 
 
 @lru_cache(maxsize=64)
-def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kept]:
+def _with_adjoint(
+    system: System, what: What, segment: int, devices: Devices
+) -> Callable[..., Kept]:
     def run(segment: int | None, _: None, *trees: Any) -> Any:
         def scan(_: None, *trees: Any) -> Any:
             return _scan(system, what, False, segment, *trees)
 
-        kept, starts = _in_blocks(_whole(system, scan), None, *trees)
+        kept, starts = _in_blocks(devices, _whole(system, scan), None, *trees)
         if segment is None:
             return kept, None
         return kept, Blocks(starts, jnp.zeros((jax.tree.leaves(trees)[0].shape[0], 0)))
 
-    ahead = _over_more_runs(partial(run, None))
-    ahead_saving = _over_more_runs(partial(run, segment))
+    ahead = _over_more_runs(devices, partial(run, None))
+    ahead_saving = _over_more_runs(devices, partial(run, segment))
 
     @jax.custom_vjp
     def function(prepared: Any, belief: Belief, given: Given) -> Kept:
@@ -411,7 +440,7 @@ def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kep
             not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
         )
         chosen = [c for flag, c in zip(live, every, strict=True) if flag]
-        back = _backward(system, what, segment, flags.given, live)
+        back = _backward(system, what, segment, devices, flags.given, live)
         total, first, of_given = back(starts, prepared, given, chosen)[0]
         return _unfilled(prepared, None, total), first, _unfilled(given, flags.given, of_given)
 
@@ -421,15 +450,20 @@ def _with_adjoint(system: System, what: What, segment: int) -> Callable[..., Kep
 
 @lru_cache(maxsize=256)
 def _backward(
-    system: System, what: What, segment: int, moving: tuple[bool, ...], live: tuple[bool, ...]
+    system: System,
+    what: What,
+    segment: int,
+    devices: Devices,
+    moving: tuple[bool, ...],
+    live: tuple[bool, ...],
 ) -> Callable[..., Any]:
     def scan(starts: Belief, *trees: Any) -> Any:
         return _scan_back(system, what, segment, moving, live, starts, *trees), None
 
     def run(starts: Blocks, *trees: Any) -> Any:
-        return _in_blocks(_whole(system, scan), starts.arrays, *trees)
+        return _in_blocks(devices, _whole(system, scan), starts.arrays, *trees)
 
-    return _over_more_runs(run)
+    return _over_more_runs(devices, run)
 
 
 def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:

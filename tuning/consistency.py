@@ -1,5 +1,6 @@
 """Whether errors are as large as their covariances say, and the scale that makes them so."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -14,9 +15,9 @@ from tuning.objectives import output_error, run_batch
 
 
 @partial(jax.jit, static_argnums=0)
-def _mean_nees(model: Model, params: Parameters, data: Data) -> Array:
-    """Mean normalised squared attitude error by degree of freedom, over all judged instants."""
-    output = run_batch(model, params, data)
+def _nees(model: Model, params: Parameters, data: Data) -> tuple[Array, Array]:
+    """Sum of normalised squared attitude errors over all judged instants, and of degrees of freedom."""
+    output = run_batch(model, params, data, "estimates")
     runs = data.steps.dt.shape[0]
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
     error = output_error(model, params, output, data, "attitude")
@@ -26,20 +27,21 @@ def _mean_nees(model: Model, params: Parameters, data: Data) -> Array:
     safe = jnp.where(judged[..., None, None], cov, jnp.broadcast_to(eye, cov.shape))
     solved = jnp.linalg.solve(safe, error[..., None])[..., 0]
     squared = jnp.where(judged, jnp.sum(error * solved, axis=-1), 0.0)
-    return jnp.sum(squared) / (error.shape[-1] * jnp.sum(judged))
+    return jnp.sum(squared), error.shape[-1] * jnp.sum(judged)
 
 
-def scale(model: Model, params: Parameters, data: Data) -> float:
+def scale(model: Model, params: Parameters, groups: Sequence[Data]) -> float:
     """The factor for Q, R and P0 at which the attitude errors match their covariances on average.
 
     Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set).
     """
-    if "attitude" not in data.truth or not bool(jnp.any(data.truth["attitude"].judged)):
+    if not any("attitude" in d.truth and bool(jnp.any(d.truth["attitude"].judged)) for d in groups):
         raise TuningError(
             "got no scored encoder sample, expected some to compare covariances with; tune by"
             " likelihood without rescaling"
         )
-    factor = float(_mean_nees(model, params, data))
+    found = [_nees(model, params, data) for data in groups]
+    factor = float(sum(squared for squared, _ in found) / sum(freedom for _, freedom in found))
     if not 0.0 < factor < float("inf"):
         raise TuningError(
             f"got a mean normalised error of {factor}, expected a positive one; look for exact data"

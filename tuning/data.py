@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxekf import storage, timeline
+from jaxekf import padding, storage, timeline
 from jaxekf.errors import TuningError
-from jaxekf.estimation import Run, bucketed
+from jaxekf.estimation import Run
 from jaxekf.model import Model
 from jaxekf.recording import Recording, encoder_at, encoder_rate_at
 from jaxekf.timeline import Steps, Timeline
@@ -38,15 +38,54 @@ class Data(NamedTuple):
 def prepare(
     model: Model, runs: Sequence[Run], *, burn_in_s: float = 0.0, need_truth: bool = True
 ) -> Data:
-    """Timelines, initial means and truth of runs, stacked.
+    """Timelines, initial means and truth of runs, stacked and padded to one length.
 
     Raises `TuningError` without any run or where truth is needed and none is scored.
     """
+    recordings, lines = _read(model, runs)
+    data = _stack(model, recordings, lines, burn_in_s)
+    _check([data], recordings, burn_in_s, need_truth)
+    return data
+
+
+def prepare_groups(
+    model: Model, runs: Sequence[Run], *, burn_in_s: float = 0.0, need_truth: bool = True
+) -> tuple[Data, ...]:
+    """As `prepare`, but runs of like length together: a short run is not padded to the longest."""
+    recordings, lines = _read(model, runs)
+    found = []
+    for members in padding.groups(lines):
+        chosen = [recordings[i] for i in members], [lines[i] for i in members]
+        found.append(_stack(model, *chosen, burn_in_s))
+    _check(found, recordings, burn_in_s, need_truth)
+    return tuple(found)
+
+
+def _read(model: Model, runs: Sequence[Run]) -> tuple[list[Recording], list[Timeline]]:
     if not runs:
         raise TuningError("got no run to tune on, expected at least one; name some recordings")
     recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
-    lines = timeline.build_many(model, recordings)
-    steps = bucketed(lines)
+    return recordings, timeline.build_many(model, recordings)
+
+
+def _check(
+    found: Sequence[Data], recordings: Sequence[Recording], burn_in_s: float, need_truth: bool
+) -> None:
+    if not any(bool(data.counted.any()) for data in found):
+        raise TuningError(
+            f"got no instant after a burn-in of {burn_in_s} s, expected some; ask for a shorter one"
+        )
+    if need_truth and not any(bool(t.judged.any()) for data in found for t in data.truth.values()):
+        raise TuningError(
+            f"got no scored encoder sample in {[r.name for r in recordings]}, expected some to"
+            " compare with; add encoder.csv or tune by likelihood"
+        )
+
+
+def _stack(
+    model: Model, recordings: Sequence[Recording], lines: Sequence[Timeline], burn_in_s: float
+) -> Data:
+    steps = padding.bucketed(lines)
     means = [model.initial_mean(line.first) for line in lines]
     shape = steps.dt.shape
     names = [out.name for out in model.outputs if out.name in ("attitude", "rate")]
@@ -62,15 +101,6 @@ def prepare(
             if name in truth:
                 truth[name].value[place] = value
                 truth[name].judged[place] = known & settled
-    if not counted.any():
-        raise TuningError(
-            f"got no instant after a burn-in of {burn_in_s} s, expected some; ask for a shorter one"
-        )
-    if need_truth and not any(t.judged.any() for t in truth.values()):
-        raise TuningError(
-            f"got no scored encoder sample in {[r.name for r in recordings]}, expected some to"
-            " compare with; add encoder.csv or tune by likelihood"
-        )
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
     return jax.tree.map(jnp.asarray, Data(stacked, steps, truth, counted))
 

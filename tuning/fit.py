@@ -21,9 +21,9 @@ from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import Recording
 from tuning import consistency
-from tuning.data import Data, prepare
+from tuning.data import Data, prepare_groups
 from tuning.noise import Layout, layout, scaled, with_axes
-from tuning.objectives import Objective, attitude_error, evaluate, parse
+from tuning.objectives import Objective, attitude_error, count, evaluate, parse, weights_of
 
 _MOST_REJECTIONS = 10
 _IMPROVEMENT = 1e-4
@@ -75,19 +75,31 @@ class Tuned:
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _value_and_gradient(
-    model: Model, objective: Objective, where: Layout, free: Array, base: Parameters, data: Data
+    model: Model,
+    objective: Objective,
+    where: Layout,
+    free: Array,
+    base: Parameters,
+    data: Data,
+    counts: dict[str, Array],
 ) -> tuple[Array, Array]:
     def value(free: Array) -> Array:
-        return evaluate(model, objective, where.from_free(free, base), data)
+        return evaluate(model, objective, where.from_free(free, base), data, counts)
 
     return jax.value_and_grad(value)(free)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _value(
-    model: Model, objective: Objective, where: Layout, free: Array, base: Parameters, data: Data
+    model: Model,
+    objective: Objective,
+    where: Layout,
+    free: Array,
+    base: Parameters,
+    data: Data,
+    counts: dict[str, Array],
 ) -> Array:
-    return evaluate(model, objective, where.from_free(free, base), data)
+    return evaluate(model, objective, where.from_free(free, base), data, counts)
 
 
 def tune(
@@ -130,15 +142,15 @@ def tune(
     where = layout(chosen, base, free)
     _check_runs(runs, validate)
     need_truth = bool(aim.errors)
-    training = prepare(chosen, runs, burn_in_s=burn_in_s, need_truth=need_truth)
+    training = prepare_groups(chosen, runs, burn_in_s=burn_in_s, need_truth=need_truth)
     held_out = None
     if validate:
-        held_out = prepare(chosen, validate, burn_in_s=burn_in_s, need_truth=need_truth)
+        held_out = prepare_groups(chosen, validate, burn_in_s=burn_in_s, need_truth=need_truth)
     search = _Search(chosen, aim, where, base, training, held_out)
     best_free, best, history, stopped = search.run(optimiser, iterations, patience, progress)
     params = where.from_free(best_free, base)
     scale = 1.0
-    if rescale if rescale is not None else not aim.likelihood and "attitude" in training.truth:
+    if rescale if rescale is not None else not aim.likelihood and "attitude" in training[0].truth:
         scale = consistency.scale(chosen, params, training)
         params = scaled(params, scale)
     origin = {
@@ -156,6 +168,12 @@ def tune(
     if validate:
         origin["validation_value"] = best.validation
     return Tuned(chosen, params, base, aim, best, tuple(history), stopped, scale, where, origin)
+
+
+def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Array]:
+    """What each term of the objective is the mean over, of all groups together."""
+    found = [count(data, tuple(weights_of(objective))) for data in groups]
+    return {name: sum((f[name] for f in found), jnp.zeros((), int)) for name in found[0]}
 
 
 def _check_runs(runs: Sequence[Run], validate: Sequence[Run]) -> None:
@@ -180,22 +198,32 @@ class _Search:
     objective: Objective
     layout: Layout
     base: Parameters
-    training: Data
-    validation: Data | None
+    training: tuple[Data, ...]
+    validation: tuple[Data, ...] | None
     found: tuple[Array, Iteration, list[Iteration]] | None = None
     """The best so far, for an interrupted search."""
 
     def value_and_gradient(self, free: Array) -> tuple[float, Array]:
-        value, gradient = _value_and_gradient(
-            self.model, self.objective, self.layout, free, self.base, self.training
+        counts = total_counts(self.training, self.objective)
+        found = [
+            _value_and_gradient(
+                self.model, self.objective, self.layout, free, self.base, data, counts
+            )
+            for data in self.training
+        ]
+        return float(sum(value for value, _ in found)), sum(
+            (gradient for _, gradient in found), jnp.zeros_like(free)
         )
-        return float(value), gradient
 
     def validation_value(self, free: Array) -> float:
         if self.validation is None:
             return float("nan")
+        counts = total_counts(self.validation, self.objective)
         return float(
-            _value(self.model, self.objective, self.layout, free, self.base, self.validation)
+            sum(
+                _value(self.model, self.objective, self.layout, free, self.base, data, counts)
+                for data in self.validation
+            )
         )
 
     def run(

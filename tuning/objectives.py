@@ -1,5 +1,6 @@
 """What the tuner minimises, as one differentiable number over all runs at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from jax import Array
 
 from jaxekf import ekf, manifold
 from jaxekf.errors import TuningError
+from jaxekf.estimation import sharing_devices
 from jaxekf.model import Belief, Model, Parameters
 from tuning.data import Data
 
@@ -89,12 +91,17 @@ def parse(text: str) -> Objective:
     return total
 
 
-def run_batch(model: Model, params: Parameters, data: Data) -> ekf.FilterOutput:
+def run_batch(
+    model: Model, params: Parameters, data: Data, keep: ekf.Keep = "means"
+) -> ekf.FilterOutput:
     """The filter over all runs with shared parameters."""
     runs = data.steps.dt.shape[0]
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
     cov = jax.vmap(model.initial_covariance)(every)
-    return ekf.run_filter_batch(model, every, Belief(data.means, cov), data.steps)
+    belief = Belief(data.means, cov)
+    return ekf.run_filter_batch(
+        model, every, belief, data.steps, keep=keep, devices=sharing_devices()
+    )
 
 
 def output_values(model: Model, params: Parameters, output: ekf.FilterOutput, name: str) -> Any:
@@ -106,39 +113,69 @@ def output_values(model: Model, params: Parameters, output: ekf.FilterOutput, na
     return jax.vmap(jax.vmap(jax.vmap(value)))(output.instants.updated.mean, output.inputs)
 
 
-def evaluate(model: Model, objective: Objective, params: Parameters, data: Data) -> Array:
+def evaluate(
+    model: Model,
+    objective: Objective,
+    params: Parameters,
+    data: Data,
+    counts: dict[str, Array] | None = None,
+) -> Array:
     """The objective of all runs, a scalar with a gradient to every parameter.
 
-    Samples of all runs are pooled, so that a longer run weighs more.
+    Samples of all runs are pooled, so that a longer run weighs more. Where `data` is one group of several,
+    `counts` are those of `count` over all groups: the values of the groups then add up to that of all.
     """
+    weights = weights_of(objective)
+    found = terms(model, params, data, tuple(weights), counts)
+    return sum((weight * found[name] for name, weight in weights.items()), jnp.zeros(()))
+
+
+def weights_of(objective: Objective) -> dict[str, float]:
+    """Weight of each term of an objective, by name."""
     weights: dict[str, float] = {}
     for name, weight in objective.errors:
         weights[name] = weights.get(name, 0.0) + weight
     if objective.likelihood:
         weights["likelihood"] = objective.likelihood
-    found = terms(model, params, data, tuple(weights))
-    return sum((weight * found[name] for name, weight in weights.items()), jnp.zeros(()))
+    return weights
 
 
-def terms(model: Model, params: Parameters, data: Data, names: tuple[str, ...]) -> dict[str, Array]:
+def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
+    """What each term is the mean over: judged instants, and for the likelihood visible rows."""
+    found = {}
+    for name in names:
+        if name == "likelihood":
+            found[name] = _visible_rows(data)
+        elif name in data.truth:
+            found[name] = jnp.sum(data.truth[name].judged)
+    return found
+
+
+def terms(
+    model: Model,
+    params: Parameters,
+    data: Data,
+    names: tuple[str, ...],
+    counts: dict[str, Array] | None = None,
+) -> dict[str, Array]:
     """Single terms of an objective, unweighted, from one run of the filter.
 
     An output's name stands for its mean squared error, ``likelihood`` for the negative mean
-    log-likelihood of a measured row.
+    log-likelihood of a visible row. `counts` as in `evaluate`.
     """
     output = run_batch(model, params, data)
+    counts = count(data, names) if counts is None else counts
     found: dict[str, Array] = {}
     for name in names:
         if name == "likelihood":
             likelihood = jnp.where(data.counted, output.instants.log_likelihood, 0.0)
-            rows = jnp.maximum(_rows_used(output, data), 1)
-            found[name] = -jnp.sum(likelihood) / rows
+            found[name] = -jnp.sum(likelihood) / jnp.maximum(counts[name], 1)
             continue
         error = output_error(model, params, output, data, name)
         judged = data.truth[name].judged
         squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
         scale = _DEGREES_SQUARED if _is_angular(model, name) else 1.0
-        found[name] = scale * squared / jnp.maximum(jnp.sum(judged), 1)
+        found[name] = scale * squared / jnp.maximum(counts[name], 1)
     return found
 
 
@@ -164,10 +201,10 @@ def _is_angular(model: Model, name: str) -> bool:
     return manifold.error_units(model.output(name).space)[0].startswith("rad")
 
 
-def _rows_used(output: ekf.FilterOutput, data: Data) -> Array:
+def _visible_rows(data: Data) -> Array:
     """Number of rows whose likelihood counts."""
     total = jnp.zeros((), int)
-    for name, innovation in output.innovations.items():
+    for name, rows in (data.steps.fast | data.steps.slow).items():
         counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
-        total = total + jnp.sum(innovation.used & counted[..., None])
+        total = total + jnp.sum(rows.mask & counted[..., None])
     return total

@@ -1,0 +1,160 @@
+"""Other models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`."""
+
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jaxekf import manifold, run_filter_batch
+from jaxekf.ekf import inputs_of
+from jaxekf.model import Belief, Model, Parameters
+from jaxekf.models import loose
+from jaxekf.timeline import Knots, Rows, Steps
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+import toy_models  # noqa: E402
+
+_RUNS, _STEPS, _DT = 64, 500, 0.01
+
+
+def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> tuple[Any, Array]:
+    """One run of a model whose sensors are all sampled at every step, without gates."""
+    n = model.error_dim
+    inputs = inputs_of(model, params, steps)
+
+    def step(carry: Any, given: Any) -> Any:
+        x, p = carry
+        u, dt, samples = given
+        size = model.process_noise(params, dt).shape[0]
+
+        def moved(delta: Array, w: Array) -> Any:
+            y = model.transition(manifold.retract(model.space, x, delta), u, dt, w, params)
+            return manifold.local(model.space, ahead, y)
+
+        still = jnp.zeros(size)
+        ahead = model.transition(x, u, dt, still, params)
+        f, g = jax.jacfwd(moved, (0, 1))(jnp.zeros(n), still)
+        p = f @ p @ f.T + g @ model.process_noise(params, dt) @ g.T
+        slopes, errors, noises = [], [], []
+        for name, rows in samples.items():
+            sensor = model.sensor(name)
+            expected = sensor.predict(ahead, u, params, rows.aux)
+
+            def seen(delta: Array, sensor: Any = sensor, rows: Any = rows, expected: Any = expected) -> Any:
+                y = manifold.retract(model.space, ahead, delta)
+                return manifold.local(
+                    sensor.space, expected, sensor.predict(y, u, params, rows.aux)
+                )
+
+            slopes.append(jax.jacfwd(seen)(jnp.zeros(n)))
+            errors.append(manifold.local(sensor.space, expected, rows.value))
+            noises.append(sensor.noise(params, rows.aux, rows.dt))
+        h, e = jnp.concatenate(slopes), jnp.concatenate(errors)
+        r = jax.scipy.linalg.block_diag(*noises)
+        s = h @ p @ h.T + r
+        factor = jax.scipy.linalg.cho_factor(s, lower=True)
+        gain = jax.scipy.linalg.cho_solve(factor, h @ p).T
+        fit = e @ jax.scipy.linalg.cho_solve(factor, e)
+        logdet = 2.0 * jnp.sum(jnp.log(jnp.diag(factor[0])))
+        gained = -0.5 * (fit + logdet + len(e) * jnp.log(2 * jnp.pi))
+        delta = gain @ e
+        a = jnp.eye(n) - gain @ h
+        p = a @ p @ a.T + gain @ r @ gain.T
+        reset = manifold.reset_jacobian(model.space, delta)
+        p = reset @ p @ reset.T
+        x = manifold.retract(model.space, ahead, delta)
+        return (x, 0.5 * (p + p.T)), (x, gained)
+
+    given = jax.tree.map(lambda a: a[:, 0], (inputs, steps.dt, steps.fast))
+    _, (means, gained) = lax.scan(step, tuple(belief), given)
+    return means, jnp.sum(gained)
+
+
+def _steps(model: Model, runs: int) -> Steps:
+    """Plausible input and samples near the start; what they say does not change the work."""
+    rng = np.random.default_rng(2)
+    time = np.broadcast_to(_DT * np.arange(_STEPS)[:, None], (runs, _STEPS, 1))
+    dt = np.full((runs, _STEPS, 1), _DT)
+    dt[:, 0] = 0.0
+    channels = 3 if model.name == "loose" else 6
+    values = 0.1 * rng.normal(size=(runs, _STEPS, channels))
+    if channels == 6:
+        values[..., 2] += 9.81
+    integral = np.concatenate(
+        [np.zeros((runs, 1, channels)), np.cumsum(_DT * (values[:, 1:] + values[:, :-1]) / 2, 1)], 1
+    )
+    fast = {}
+    for sensor in model.sensors:
+        shape = (runs, _STEPS, 1)
+        if model.name == "loose":
+            value = np.zeros((*shape, 4))
+            value[..., 0], aux = 1.0, None
+        else:
+            arm = model.parameters.calibration.p_body_marker[int(sensor.name[-1])]
+            value, aux = arm + 1e-4 * rng.normal(size=(*shape, 3)), np.ones(shape)
+        mask = np.ones((*shape, sensor.rows), bool)
+        fast[sensor.name] = Rows(value, aux, mask, np.full(shape, _DT))
+    knots = Knots(time[..., 0], values, integral)
+    return Steps(time, dt, np.ones((runs, _STEPS, 1), bool), knots, fast, {})
+
+
+def _ungated(model: Model) -> Model:
+    from dataclasses import replace
+
+    return replace(model, sensors=tuple(replace(s, gate=None) for s in model.sensors))
+
+
+def race(seconds: float) -> dict[str, dict[str, float]]:
+    """Microseconds per step and run of both, forward and value with gradient to all parameters."""
+    found = {}
+    for name, model in (("loose", loose.MODEL), ("markers, 15 d.o.f.", _ungated(toy_models.MARKERS))):
+        params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
+        steps = jax.tree.map(jnp.asarray, _steps(model, _RUNS))
+        x = model.initial_mean({})
+        belief = Belief(x, model.initial_covariance(params))
+
+        def own(params: Any, steps: Any, model: Model = model, belief: Belief = belief) -> Any:
+            every = jax.tree.map(
+                lambda a: jnp.broadcast_to(a, (_RUNS, *jnp.shape(a))), (params, belief)
+            )
+            devices = jax.devices() if len(jax.devices()) > 1 else ()
+            output = run_filter_batch(model, *every, steps, keep="means", devices=devices)
+            return jax.tree.leaves(output.instants.updated.mean), jnp.sum(
+                output.instants.log_likelihood
+            )
+
+        def plain(params: Any, steps: Any, model: Model = model, belief: Belief = belief) -> Any:
+            one = partial(textbook, model, params, belief)
+            means, gained = jax.vmap(one)(steps)
+            return jax.tree.leaves(means), jnp.sum(gained)
+
+        np.testing.assert_allclose(
+            jax.jit(own)(params, steps)[1], jax.jit(plain)(params, steps)[1], rtol=1e-8
+        )
+        found[f"{name}, forward"] = _both(own, plain, params, steps, seconds)
+        slopes = [jax.value_and_grad(lambda p, s, f=f: f(p, s)[1]) for f in (own, plain)]
+        found[f"{name}, gradient"] = _both(*slopes, params, steps, seconds)
+    return found
+
+
+def _both(own: Callable[..., Any], plain: Callable[..., Any], *args: Any) -> dict[str, float]:
+    *args, seconds = args
+    times = {}
+    for name, function in (("jaxekf", jax.jit(own)), ("textbook JAX", jax.jit(plain))):
+        jax.block_until_ready(function(*args))
+        taken = []
+        until = time.perf_counter() + seconds
+        while len(taken) < 3 or time.perf_counter() < until:
+            begin = time.perf_counter()
+            jax.block_until_ready(function(*args))
+            taken.append(time.perf_counter() - begin)
+        times[name] = median(taken) / (_RUNS * _STEPS) * 1e6
+    return times

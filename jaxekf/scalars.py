@@ -227,7 +227,8 @@ def _whole(operation: Operation, operands: list[Numbers], sources: list[Array]) 
             plain.append(_compute([numbers], sources, width)[0])
     axes = [None if flag else -1 for flag in constant]
     if all(constant):
-        return [_constants(v) for v in operation.bind(plain)]
+        with jax.ensure_compile_time_eval():
+            return [_constants(v) for v in operation.bind(plain)]
     outputs = jax.vmap(lambda *v: operation.bind(v), in_axes=axes, out_axes=-1)(*plain)
     found = []
     for output in outputs:

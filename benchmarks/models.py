@@ -20,7 +20,7 @@ from jaxekf.models import loose
 from jaxekf.timeline import Knots, Rows, Steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import toy_models  # noqa: E402
+import toy_models
 
 _RUNS, _STEPS, _DT = 64, 500, 0.01
 
@@ -48,7 +48,9 @@ def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> 
             sensor = model.sensor(name)
             expected = sensor.predict(ahead, u, params, rows.aux)
 
-            def seen(delta: Array, sensor: Any = sensor, rows: Any = rows, expected: Any = expected) -> Any:
+            def seen(
+                delta: Array, sensor: Any = sensor, rows: Any = rows, expected: Any = expected
+            ) -> Any:
                 y = manifold.retract(model.space, ahead, delta)
                 return manifold.local(
                     sensor.space, expected, sensor.predict(y, u, params, rows.aux)
@@ -115,7 +117,10 @@ def _ungated(model: Model) -> Model:
 def race(seconds: float) -> dict[str, dict[str, float]]:
     """Microseconds per step and run of both, forward and value with gradient to all parameters."""
     found = {}
-    for name, model in (("loose", loose.MODEL), ("markers, 15 d.o.f.", _ungated(toy_models.MARKERS))):
+    for name, model in (
+        ("loose", loose.MODEL),
+        ("markers, 15 d.o.f.", _ungated(toy_models.MARKERS)),
+    ):
         params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
         steps = jax.tree.map(jnp.asarray, _steps(model, _RUNS))
         x = model.initial_mean({})

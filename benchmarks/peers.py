@@ -29,9 +29,7 @@ def available(name: str) -> bool:
 def ours(noise: Noise, given: Any) -> tuple[Any, Any]:
     """This project, as a user calls it, on all devices there are."""
     runs = given.dt.shape[0]
-    params = jax.tree.map(
-        lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), parameters(noise)
-    )
+    params = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), parameters(noise))
     devices = jax.devices() if len(jax.devices()) > 1 else ()
     output = run_filter_batch(MODEL, params, start(runs), given, keep="means", devices=devices)
     mean = jnp.concatenate(jax.tree.leaves(output.instants.updated.mean), axis=-1)
@@ -187,9 +185,7 @@ def yardsticks() -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         for name in ("scalar_ekf", "simd_limit"):
             program = Path(folder) / name
-            subprocess.run(
-                [compiler, *flags, YARDSTICK / f"{name}.cpp", "-o", program], check=True
-            )
+            subprocess.run([compiler, *flags, YARDSTICK / f"{name}.cpp", "-o", program], check=True)
             text = subprocess.run([program], check=True, capture_output=True, text=True).stdout
             for line in text.splitlines():
                 value = float(line.split("us/step/run ")[1].split()[0])

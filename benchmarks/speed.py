@@ -58,7 +58,7 @@ def agree(filters: dict[str, tuple[object, object]]) -> None:
         np.testing.assert_allclose(other, mean, rtol=0, atol=2e-5 if loose else 1e-8, err_msg=name)
         np.testing.assert_allclose(likelihood, total, rtol=1e-3 if loose else 1e-7, err_msg=name)
     slopes = {
-        name: np.concatenate(jax.grad(lambda n, run=run, z=give(z): run(n, z)[1])(NOISE))
+        name: np.concatenate(jax.grad(lambda n, g, run=run: run(n, g)[1])(NOISE, give(z)))
         for name, (run, give) in filters.items()
     }
     for name, slope in slopes.items():
@@ -95,7 +95,9 @@ def main() -> None:
         "processor": processor(),
     }
     print(", ".join(f"{key} {value}" for key, value in where.items()))
-    print("all filters agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)")
+    print(
+        "all filters agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)"
+    )
     sizes = (1, 64) if quick else (1, 64, 1024)
     seconds = 0.5 if quick else 3.0
     speed: dict[str, dict[str, float]] = {}
@@ -181,7 +183,9 @@ def show(
         table.add_column(column, justify="right")
     for name, row in speed.items():
         cells = [
-            f"{row[c]:.3f}" + (f" ({first[name][c]:.1f})" if name in first else "") if c in row else ""
+            f"{row[c]:.3f}" + (f" ({first[name][c]:.1f})" if name in first else "")
+            if c in row
+            else ""
             for c in columns
         ]
         table.add_row(name, *cells)

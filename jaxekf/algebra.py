@@ -6,7 +6,7 @@ others, to the log-likelihood and to the slope of the measurement.
 """
 
 import operator
-from functools import lru_cache, partial, reduce
+from functools import cache, partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -91,7 +91,7 @@ def _congruence_pullback(
     return loop(slope, cotangent, half), cov
 
 
-@lru_cache(maxsize=None)
+@cache
 def congruence_with_adjoint(p: Pattern) -> Any:
     """`congruence` of (block, P) with its derivative; returns ``M P M'`` only."""
 
@@ -243,10 +243,9 @@ def _innovation_column(
     """Rows j and later of column j of ``H P H' + R``, hidden rows as in the identity."""
     value = patterned.multiply(p, slope, projected[j])[j:]
     first = np.arange(mask.shape[0] - j)[:, None] == 0
-    if noise.ndim == 2:
-        value = value + jnp.where(first, noise[j][None], 0.0)
-    else:
-        value = value + noise[j:, j]
+    value = (
+        value + jnp.where(first, noise[j][None], 0.0) if noise.ndim == 2 else value + noise[j:, j]
+    )
     return jnp.where(mask[j:] & mask[j][None], value, first.astype(value.dtype))
 
 
@@ -294,9 +293,7 @@ def _take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, _Solve
         return half + sum_of_outer(rest, gain)
 
     half = loop(half_way, gained.cov, gain, solved.projected)
-    rest = [
-        loop(partial(remainder, i=i), half, rows.slope, gain) for i in range(mask.shape[0])
-    ]
+    rest = [loop(partial(remainder, i=i), half, rows.slope, gain) for i in range(mask.shape[0])]
     cov = loop(finish, half, rest, gain)
 
     def move(delta: Array, gain: list[Array], residual: list[Array]) -> Array:
@@ -367,7 +364,9 @@ def _update_pullback(
     pulled = a - loop(partial(patterned.multiply, back), turned, lowered)  # A' a
 
     # With N = K' B K + M the whole is B - H' T - T' H,  T = K' B - N H / 2 - s (A' a)' / 2.
-    def half(slope: Array | None, inner: Array, turned_b: Array, scaled: Array, pulled: Array) -> Array:
+    def half(
+        slope: Array | None, inner: Array, turned_b: Array, scaled: Array, pulled: Array
+    ) -> Array:
         drawn = patterned.multiply(p.transposed, patterned.transpose(slope), inner, axis=1)
         return turned_b - 0.5 * (drawn + outer(scaled, pulled))
 
@@ -392,7 +391,7 @@ def _update_pullback(
     return Gained(cov, delta, weight), Rows(error, slope_bar, noise, mask)
 
 
-@lru_cache(maxsize=None)
+@cache
 def update_with_adjoint(p: Pattern) -> Any:
     """`update` of (gained, rows) with its derivative in closed form."""
 

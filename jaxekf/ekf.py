@@ -60,7 +60,7 @@ class Instant(NamedTuple):
     predicted: Belief | None
     """None where only estimates or means were kept."""
     updated: Any
-    """`Belief`; its covariance is None where only means were kept."""
+    """`Belief`, or `Updated` where only means were kept."""
     log_likelihood: Array
     """Log density of the rows used, given all rows before them."""
     healthy: Array
@@ -117,7 +117,7 @@ def run_filter_batch(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
-    devices: Sequence[jax.Device] = (),
+    devices: Sequence[Any] = (),
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
 
@@ -131,11 +131,11 @@ def run_filter_batch(
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     inputs = jax.vmap(partial(inputs_of, model))(params, steps)
-    sizes = jax.tree.map(
+    sizes: Any = jax.tree.map(
         lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), (params, belief.mean)
     )
     u, fast = _one_sample((inputs, steps.fast), 3)
-    ready = system.build(model, *sizes, u, fast | _one_sample(steps.slow, 2))
+    ready = system.build(model, sizes[0], sizes[1], u, fast | _one_sample(steps.slow, 2))
     prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
     given = Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
     what = _KEPT[keep]
@@ -150,7 +150,7 @@ def run_filter_batch(
         kept = recursion.filter_with_adjoint(ready, what, segment, tuple(devices), *moving)
     else:
         kept = recursion.filter_plainly(ready, what, checkpoint, prepared, belief, given)
-    updated = Belief(kept.mean, kept.cov)
+    updated: Any = Updated(kept.mean, kept.cov) if kept.cov is None else Belief(kept.mean, kept.cov)
     instants = Instant(kept.prior, updated, kept.log_likelihood, kept.healthy)
     innovations = _innovations(model, params, inputs, steps, kept) if what.used else {}
     return FilterOutput(instants, inputs, innovations)
@@ -177,7 +177,8 @@ def _innovations(
     found = {}
     for name, rows in (steps.fast | steps.slow).items():
         fast = name in steps.fast
-        prior, u = kept.prior, inputs
+        prior: Any = kept.prior
+        u: Any = inputs
         if not fast:
             prior, u = jax.tree.map(lambda a: a[:, :, -1], (prior, u))
         one = partial(_innovation, model, model.sensor(name))
@@ -189,7 +190,14 @@ def _innovations(
 
 
 def _innovation(
-    model: Model, sensor: Sensor, params: Parameters, prior: Belief, u: Any, rows: Rows, used: Array, gated: Array
+    model: Model,
+    sensor: Sensor,
+    params: Parameters,
+    prior: Belief,
+    u: Any,
+    rows: Rows,
+    used: Array,
+    gated: Array,
 ) -> Innovation:
     """One sensor's innovation at one instant."""
     residual, jacobian, noise = linearise_sensor(model, sensor, params, prior.mean, u, rows)
@@ -199,5 +207,3 @@ def _innovation(
     cov = linalg.symmetrise(spread + noise)
     white = linalg.whiten(linalg.whitener(cov), residual)
     return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, jnp.sum(white * white))
-
-

@@ -160,7 +160,8 @@ def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
 def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
     """The sensors used at a broken substep, or the prediction where that was broken already."""
     epochs, substeps = line.time_ns.shape
-    predicted = np.asarray(output.instants.predicted.cov)[:epochs, -substeps:][k, s].diagonal()
+    beliefs: Any = output.instants.predicted
+    predicted = np.asarray(beliefs.cov)[:epochs, -substeps:][k, s].diagonal()
     if not np.all(np.isfinite(predicted) & (predicted >= 0.0)):
         return "in the prediction"
     used = []

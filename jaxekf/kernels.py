@@ -28,7 +28,9 @@ def block(function: Callable[..., Any], *args: Any) -> Any:
 
     def touching(*args: Any) -> Any:
         # XLA (jaxlib 0.10 to 0.12) aborts where such a call has an operand that nothing in it reads.
-        corners = [lax.slice(a, (0,) * a.ndim, (1,) * a.ndim) for a in jax.tree.leaves(args) if a.size]
+        corners = [
+            lax.slice(a, (0,) * a.ndim, (1,) * a.ndim) for a in jax.tree.leaves(args) if a.size
+        ]
         return function(*args), corners
 
     return _called(touching, args, _BLOCK)[0]

@@ -24,21 +24,6 @@ def multiply_transposed(left: Array, right: Array) -> Array:
     return jnp.sum(left[:, None] * right[None], axis=2)
 
 
-def apply(matrix: Array, vector: Array) -> Array:
-    """Matrix times vector, shapes (i, k, ...), (k, ...) to (i, ...)."""
-    return jnp.sum(matrix * vector[None], axis=1)
-
-
-def outer(left: Array, right: Array) -> Array:
-    """Outer product, shapes (i, ...), (j, ...) to (i, j, ...)."""
-    return left[:, None] * right[None]
-
-
-def diagonal(matrix: Array) -> Array:
-    """Diagonal, (n, n, ...) to (n, ...)."""
-    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
-
-
 def identity_like(matrix: Array) -> Array:
     """The identity broadcast to the shape (n, n, ...) of `matrix`."""
     size = matrix.shape[0]

@@ -91,11 +91,15 @@ def _by_parts(
     dtype = manifold.dtype_of(x)
     found = []
     for i, part in enumerate(manifold.parts(model.space)):
-        chosen = [c - part.error.start for c in columns or () if c in range(model.error_dim)[part.error]]
+        chosen = [
+            c - part.error.start for c in columns or () if c in range(model.error_dim)[part.error]
+        ]
 
         def derivative(delta: Array, i: int = i, part: manifold.Part = part) -> Array:
             def moved(leaf: Array) -> Any:
-                return function(jax.tree.unflatten(structure, [*leaves[:i], leaf, *leaves[i + 1 :]]))
+                return function(
+                    jax.tree.unflatten(structure, [*leaves[:i], leaf, *leaves[i + 1 :]])
+                )
 
             change = part.manifold.lift(leaves[i], delta)
             return lower(jax.jvp(moved, (leaves[i],), (change,))[1])

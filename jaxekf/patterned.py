@@ -72,9 +72,7 @@ def stack(patterns: Sequence[Pattern]) -> Pattern:
 
 def take(array: Array, index: Sequence[int], axis: int) -> Array:
     """Rows of `array` along `axis`, as slices of consecutive ones."""
-    pieces = [
-        lax.slice_in_dim(array, run[0], run[-1] + 1, axis=axis) for run in _runs(list(index))
-    ]
+    pieces = [lax.slice_in_dim(array, run[0], run[-1] + 1, axis=axis) for run in _runs(list(index))]
     return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
 
 
@@ -95,7 +93,9 @@ def transpose(block: Array | None) -> Array | None:
 
 def dense(p: Pattern, block: Array | None, lanes: int, dtype: Any) -> Array:
     """The whole matrix, (rows, cols, lanes)."""
-    eye = jnp.broadcast_to(jnp.eye(p.shape[1], dtype=dtype)[:, :, None], (p.shape[1],) * 2 + (lanes,))
+    eye = jnp.broadcast_to(
+        jnp.eye(p.shape[1], dtype=dtype)[:, :, None], (p.shape[1],) * 2 + (lanes,)
+    )
     return multiply(p, block, eye)
 
 

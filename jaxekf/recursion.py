@@ -109,7 +109,13 @@ def _gathered(earlier: Kept | None, last: Kept, slow: Any) -> Kept:
 
 
 def _scan(
-    system: System, what: What, adjoint: bool, segment: int | None, prepared: Any, belief: Belief, given: Given
+    system: System,
+    what: What,
+    adjoint: bool,
+    segment: int | None,
+    prepared: Any,
+    belief: Belief,
+    given: Given,
 ) -> tuple[Kept, Belief | None]:
     """All epochs; also, where `segment` is given, the belief at the start of every `segment` epochs."""
     epoch = partial(_epoch, system, what, adjoint, prepared)
@@ -243,7 +249,7 @@ class Blocks(NamedTuple):
     """Arrays as the scans leave them: (blocks, ..., lanes), the last block filled up.
 
     They stay so from the forward to the backward pass; to put the runs first and back would cost as
-    much as the filter. `runs` (runs, 0) says which runs they are.
+    much as the filter. `runs` (runs,) says how many runs they are, and of which `vmap`.
     """
 
     arrays: Any
@@ -347,16 +353,17 @@ def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[
         flags = jax.tree.map(lambda _: True, found)
         if left is None:
             return (found, None), (flags, None)
-        runs = left.runs.reshape(size, -1, 0)
+        runs = left.runs.reshape(size, -1)
         unbatched = jax.tree.map(lambda _: False, left.arrays)
-        return (found, Blocks(left.arrays, runs)), (flags, Blocks(unbatched, True))
+        batched_runs: Any = True
+        return (found, Blocks(left.arrays, runs)), (flags, Blocks(unbatched, batched_runs))
 
     return mapped
 
 
 def _merge_blocks(devices: Devices, size: int, batched: Blocks, blocks: Blocks) -> Blocks:
     """Blocks of all runs of a `vmap` of the given size."""
-    runs = blocks.runs.reshape(-1, 0) if batched.runs else jnp.tile(blocks.runs, (size, 1))
+    runs = blocks.runs.reshape(-1) if batched.runs else jnp.tile(blocks.runs, size)
     if batched.runs and not any(jax.tree.leaves(batched.arrays)):
         # Made under the same `vmap`: the blocks hold the runs of all its members already.
         return Blocks(blocks.arrays, runs)
@@ -366,7 +373,11 @@ def _merge_blocks(devices: Devices, size: int, batched: Blocks, blocks: Blocks) 
         def spread(a: Array) -> Array:
             return _join_runs(jnp.moveaxis(a, -1, 1), count)
 
-        a = jax.vmap(spread)(a) if flag else jnp.broadcast_to(spread(a), (size, count, *a.shape[1:-1]))
+        a = (
+            jax.vmap(spread)(a)
+            if flag
+            else jnp.broadcast_to(spread(a), (size, count, *a.shape[1:-1]))
+        )
         return jnp.moveaxis(_cut_runs(a.reshape(-1, *a.shape[2:]), devices), 1, -1)
 
     return Blocks(jax.tree.map(merge, batched.arrays, blocks.arrays), runs)
@@ -415,7 +426,7 @@ def _with_adjoint(
         kept, starts = _in_blocks(devices, _whole(system, scan), None, *trees)
         if segment is None:
             return kept, None
-        return kept, Blocks(starts, jnp.zeros((jax.tree.leaves(trees)[0].shape[0], 0)))
+        return kept, Blocks(starts, jnp.zeros(jax.tree.leaves(trees)[0].shape[0]))
 
     ahead = _over_more_runs(devices, partial(run, None))
     ahead_saving = _over_more_runs(devices, partial(run, segment))
@@ -461,7 +472,17 @@ def _backward(
         return _scan_back(system, what, segment, moving, live, starts, *trees), None
 
     def run(starts: Blocks, *trees: Any) -> Any:
-        return _in_blocks(devices, _whole(system, scan), starts.arrays, *trees)
+        count, size = _blocks(jax.tree.leaves(trees)[0].shape[0], devices)
+
+        def fitting(a: Array) -> Array:
+            # `custom_vmap` traces this for one member of a `vmap` before it asks for all of them, and
+            # the blocks hold all of them already: of that trace only the shapes are used.
+            if (a.shape[0], a.shape[-1]) == (count, size):
+                return a
+            return jnp.zeros((count, *a.shape[1:-1], size), a.dtype)
+
+        arrays = jax.tree.map(fitting, starts.arrays)
+        return _in_blocks(devices, _whole(system, scan), arrays, *trees)
 
     return _over_more_runs(devices, run)
 

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array, core, lax
 from numpy.typing import NDArray
 
 from jaxekf import lanes
@@ -66,7 +66,7 @@ def _graph(program: Program, values: Sequence[Array]) -> tuple[list[Numbers], li
     def read(operand: Any) -> Numbers:
         if not isinstance(operand, Constant):
             return known[operand]
-        if isinstance(operand.value, jax.core.Tracer):
+        if isinstance(operand.value, core.Tracer):
             sources.append(lanes.spread(operand.value, False, width))
             return _leaves(len(sources) - 1, operand.value.shape, operand.value.dtype)
         return _constants(operand.value)
@@ -137,7 +137,11 @@ def _order(outputs: list[Numbers]) -> tuple[list[_Node], dict[int, int]]:
 
 
 def _kept(
-    numbers: list[Any], shape: tuple[int, ...], kept: dict[int, Array], sources: list[Array], width: int
+    numbers: list[Any],
+    shape: tuple[int, ...],
+    kept: dict[int, Array],
+    sources: list[Array],
+    width: int,
 ) -> Array:
     """Numbers as one array in memory, computed from given arrays and from numbers kept before."""
     arguments: dict[Any, Array] = {}
@@ -247,9 +251,7 @@ def _is_scalar_call(operation: Operation) -> bool:
     )
 
 
-def _elementwise(
-    operation: Operation, operands: list[Numbers], made: dict[Any, _Node]
-) -> Numbers:
+def _elementwise(operation: Operation, operands: list[Numbers], made: dict[Any, _Node]) -> Numbers:
     shape = operation.shapes[0].shape
     found = np.empty(shape, object)
     spread = [np.broadcast_to(o, shape) for o in operands]
@@ -326,8 +328,37 @@ _SHORT: dict[str, Callable[..., Any]] = {
 }
 
 _CHEAP = frozenset(
-    """abs add add_any and clamp convert_element_type copy copy_p eq floor ge gt integer_pow is_finite
-    le lt max min mul ne neg not or round select_n sign square sub xor""".split()
+    [
+        "abs",
+        "add",
+        "add_any",
+        "and",
+        "clamp",
+        "convert_element_type",
+        "copy",
+        "copy_p",
+        "eq",
+        "floor",
+        "ge",
+        "gt",
+        "integer_pow",
+        "is_finite",
+        "le",
+        "lt",
+        "max",
+        "min",
+        "mul",
+        "ne",
+        "neg",
+        "not",
+        "or",
+        "round",
+        "select_n",
+        "sign",
+        "square",
+        "sub",
+        "xor",
+    ]
 )
 """What is rather computed again than kept."""
 
@@ -353,6 +384,22 @@ _ON_CONSTANTS: dict[str, Callable[..., Any]] = {
     "sqrt": np.sqrt,
     "sub": np.subtract,
 }
+
+
+class _Written:
+    """A function of numbers in the place of a primitive, whose parameters differ between versions."""
+
+    multiple_results = False
+
+    def __init__(self, name: str, function: Callable[..., Any]) -> None:
+        self.name, self.bind = name, function
+
+    def get_bind_params(self, params: dict[str, Any]) -> dict[str, Any]:
+        """None are needed."""
+        return params
+
+
+_MULTIPLY, _ADD = _Written("mul", lax.mul), _Written("add", lax.add)
 
 
 class _Arithmetic:
@@ -461,10 +508,10 @@ def _dot_general(
         for i in np.ndindex(left.shape[inner:]):
             for j in np.ndindex(right.shape[inner:]):
                 terms = [
-                    arithmetic(lax.mul_p, left[(*k, *b, *i)], right[(*k, *b, *j)])
+                    arithmetic(_MULTIPLY, left[(*k, *b, *i)], right[(*k, *b, *j)])
                     for k in itertools.product(*sums)
                 ]
-                add = functools.partial(arithmetic, lax.add_p)
+                add = functools.partial(arithmetic, _ADD)
                 found[(*b, *i, *j)] = functools.reduce(add, terms)
     return [found]
 
@@ -472,7 +519,9 @@ def _dot_general(
 def _iota(arithmetic: Any, params: dict[str, Any], operands: list[Numbers]) -> list[Numbers]:
     shape, axis = params["shape"], params["dimension"]
     line = np.arange(shape[axis], dtype=params["dtype"])
-    whole = np.broadcast_to(line.reshape([-1 if a == axis else 1 for a in range(len(shape))]), shape)
+    whole = np.broadcast_to(
+        line.reshape([-1 if a == axis else 1 for a in range(len(shape))]), shape
+    )
     return [_constants(whole)]
 
 
@@ -482,11 +531,11 @@ _RULES: dict[str, Rule] = {
     "dot_general": _dot_general,
     "iota": _iota,
     "pad": _pad,
-    "reduce_and": _reduce(lax.and_p),
-    "reduce_max": _reduce(lax.max_p),
-    "reduce_min": _reduce(lax.min_p),
-    "reduce_or": _reduce(lax.or_p),
-    "reduce_sum": _reduce(lax.add_p),
+    "reduce_and": _reduce(_Written("and", lax.bitwise_and)),
+    "reduce_max": _reduce(_Written("max", lax.max)),
+    "reduce_min": _reduce(_Written("min", lax.min)),
+    "reduce_or": _reduce(_Written("or", lax.bitwise_or)),
+    "reduce_sum": _reduce(_ADD),
     "reshape": _moved(lambda params, numbers: numbers.reshape(params["new_sizes"])),
     "rev": _moved(lambda params, numbers: np.flip(numbers, params["dimensions"])),
     "slice": _moved(_slice),

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -17,7 +16,6 @@ from jaxekf.system import Measurement, System, Transition
 from jaxekf.timeline import Rows
 
 _LARGEST_BLOCK = 7
-_MOST_BLOCKS = 4
 
 
 class Moment(NamedTuple):
@@ -66,8 +64,9 @@ def advance(
     for name, sample in samples.items():
         measurement = system.measurements[name]
         constants = prepared[f"sensor {name}"]
-        found = measurement.piece(constants, prior.mean, moment.u, sample, adjoint=adjoint)
-        one = _hide(measurement, *found, sample.mask)
+        found: Any = measurement.piece(constants, prior.mean, moment.u, sample, adjoint=adjoint)
+        residual, slope, noise = found
+        one = _hide(measurement, residual, slope, noise, sample.mask)
         gated[name] = _gate(measurement.sensor, one, prior.cov)
         linear[name] = _without(one, gated[name])
     used = {name: one.rows.mask for name, one in linear.items()}
@@ -80,7 +79,9 @@ def advance(
     for slope, rows in _blocks(system, linear):
         gained, pivot = _take(slope, gained, rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
-    posterior = _correct(system, prepared["correction"], prior, gained, list(used.values()), adjoint)
+    posterior = _correct(
+        system, prepared["correction"], prior, gained, list(used.values()), adjoint
+    )
     healthy = (smallest > 0.0) & _is_sound(posterior.cov)
     return Outcome(prior, posterior, gained.log_likelihood, healthy, used, gated)
 
@@ -113,7 +114,9 @@ def _predict(
         sigma = algebra.on_diagonal(sigma)
     elif direct:
         sigma = algebra.symmetric(sigma)
-    return Belief(mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint)))
+    return Belief(
+        mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint))
+    )
 
 
 def _hide(
@@ -163,7 +166,9 @@ def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
     return lax.stop_gradient(jnp.stack(outside) & rows.mask)
 
 
-def _take(slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool) -> tuple[Gained, Array]:
+def _take(
+    slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool
+) -> tuple[Gained, Array]:
     if adjoint:
         return algebra.update_with_adjoint(slope)(gained, rows)
     return algebra.update(slope, gained, rows)
@@ -184,9 +189,7 @@ def _blocks(system: System, linear: dict[str, _Linear]) -> list[tuple[Pattern, a
     return [_joined(system, [linear[name] for name in names], names) for names in groups]
 
 
-def _joined(
-    system: System, parts: list[_Linear], names: list[str]
-) -> tuple[Pattern, algebra.Rows]:
+def _joined(system: System, parts: list[_Linear], names: list[str]) -> tuple[Pattern, algebra.Rows]:
     """Rows of several sensors as one block."""
     if len(parts) == 1:
         return parts[0].slope, parts[0].rows
@@ -233,8 +236,3 @@ def _correct(
     else:
         cov = _congruence(correction.reset, reset, cov, adjoint)
     return Belief(mean, jnp.where(any_used[None, None], cov, prior.cov))
-
-
-def no_derivative(tree: Any) -> Any:
-    """The tree with all derivatives cut."""
-    return jax.tree.map(lax.stop_gradient, tree)

@@ -104,7 +104,7 @@ def _select(params: dict[str, Any], operands: list[Known]) -> list[Known] | None
     value = np.where(chosen, yes.value, no.value)
     known = np.where(chosen, yes.known, no.known) & which.known
     same = yes.known & no.known & (yes.value == no.value)
-    return [Known(np.where(same, yes.value, value), known | same)]
+    return [Known(np.where(same, yes.value, value), np.asarray(known | same))]
 
 
 def _moved(move: Callable[[dict[str, Any], NDArray[Any]], NDArray[Any]]) -> Rule:
@@ -177,7 +177,7 @@ def _pad(params: dict[str, Any], operands: list[Known]) -> list[Known] | None:
 
 def _reduce_sum(params: dict[str, Any], operands: list[Known]) -> list[Known]:
     axes = tuple(params["axes"])
-    return [Known(operands[0].value.sum(axes), operands[0].known.all(axes))]
+    return [Known(operands[0].value.sum(axes), np.asarray(operands[0].known.all(axes)))]
 
 
 def _dot_general(params: dict[str, Any], operands: list[Known]) -> list[Known]:
@@ -204,7 +204,9 @@ def _dot_general(params: dict[str, Any], operands: list[Known]) -> list[Known]:
 def _iota(params: dict[str, Any], operands: list[Known]) -> list[Known]:
     shape, axis = params["shape"], params["dimension"]
     line = np.arange(shape[axis], dtype=params["dtype"])
-    value = np.broadcast_to(line.reshape([-1 if a == axis else 1 for a in range(len(shape))]), shape)
+    value = np.broadcast_to(
+        line.reshape([-1 if a == axis else 1 for a in range(len(shape))]), shape
+    )
     return [Known(value, np.ones(shape, bool))]
 
 

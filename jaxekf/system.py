@@ -77,7 +77,7 @@ def _compact(body: Program, count: int, used: list[list[tuple[int, ...]]]) -> Pr
         given = iter(values)
         full = []
         for spec, indices in zip(body.inputs[:count], used, strict=True):
-            known = next(given) if indices else None
+            known: Any = next(given) if indices else ()
             numbers = [jnp.zeros((), spec.dtype)] * int(np.prod(spec.shape, dtype=int))
             for at, index in enumerate(indices):
                 numbers[int(np.ravel_multi_index(index, spec.shape)) if index else 0] = known[at]
@@ -166,7 +166,9 @@ class System:
 
 def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:
     """The system of a model for one sample of everything: arrays, or their shapes and types."""
-    spec = jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (params, x, u, rows))
+    spec = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (params, x, u, rows)
+    )
     leaves, tree = jax.tree.flatten(spec)
     return _build(model, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tree)
 
@@ -219,14 +221,18 @@ def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     return Transition(Piece(step, params, x, u, dt), state, noise, diagonal)
 
 
-def _measurement(model: Model, sensor: Sensor, params: Any, x: Any, u: Any, rows: Any) -> Measurement:
+def _measurement(
+    model: Model, sensor: Sensor, params: Any, x: Any, u: Any, rows: Any
+) -> Measurement:
     whole = _known(partial(linearise.linearise_sensor, model, sensor), params, x, u, rows)
     slope = patterned.pattern(whole[1])
     tied = ~whole[2].is_zero()
     diagonal = _is_diagonal(whole[2])
 
     def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
-        residual, h, noise = linearise.linearise_sensor(model, sensor, params, x, u, rows, slope.cols)
+        residual, h, noise = linearise.linearise_sensor(
+            model, sensor, params, x, u, rows, slope.cols
+        )
         noise = _diagonal(noise) if diagonal else noise
         return residual, _unknown_block(h, slope), noise
 

@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -203,8 +203,13 @@ class _Search:
     found: tuple[Array, Iteration, list[Iteration]] | None = None
     """The best so far, for an interrupted search."""
 
+    @cached_property
+    def training_counts(self) -> dict[str, Array]:
+        """What the terms are the means over."""
+        return total_counts(self.training, self.objective)
+
     def value_and_gradient(self, free: Array) -> tuple[float, Array]:
-        counts = total_counts(self.training, self.objective)
+        counts = self.training_counts
         found = [
             _value_and_gradient(
                 self.model, self.objective, self.layout, free, self.base, data, counts

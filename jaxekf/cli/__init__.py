@@ -7,6 +7,7 @@ from jaxekf import __version__
 from jaxekf.cli.console import Commands
 from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
+from jaxekf.cli.machine import prepare
 from jaxekf.cli.plot import plot
 from jaxekf.cli.simulate import simulate
 from jaxekf.cli.tune import tune
@@ -20,6 +21,7 @@ def main() -> None:
     A run is a folder with recording.toml, optical.csv, imu.csv and, for truth, encoder.csv.
     """
     jax.config.update("jax_enable_x64", True)
+    prepare()
 
 
 for command in (simulate, estimate, tune, plot, demo):

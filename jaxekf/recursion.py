@@ -336,19 +336,35 @@ def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[
 
     It is called with None or `Blocks` and with trees; it returns a tree and None or `Blocks`.
     """
-    mapped = custom_vmap(function)
 
-    @mapped.def_vmap
-    def _(size: int, batched: Any, blocks: Blocks | None, *trees: Any) -> Any:
+    @lru_cache(maxsize=None)
+    def mapped(tree: Any) -> Any:
+        # Arguments are leaves: the derivative of `custom_vmap` takes no None among them.
+        flat = custom_vmap(lambda leaves: function(*jax.tree.unflatten(tree, leaves)))
+        flat.def_vmap(partial(rule, tree))
+        return flat
+
+    def call(blocks: Blocks | None, *trees: Any) -> Any:
+        leaves, tree = jax.tree.flatten((blocks, *trees))
+        return mapped(tree)(leaves)
+
+    def rule(tree: Any, size: int, batched: Any, leaves: Any) -> Any:
+        blocks, *trees = jax.tree.unflatten(tree, leaves)
+        if not any(jax.tree.leaves(batched)):
+            # A derivative is taken in several directions at once: the runs are as many as before.
+            found = function(blocks, *trees)
+            return found, jax.tree.map(lambda _: False, found)
+        blocks_batched, *trees_batched = jax.tree.unflatten(tree, *batched)
+
         def merge(flag: bool, a: Array) -> Array:
             if not flag:
                 a = jnp.broadcast_to(a, (size, *a.shape))
             return a.reshape(-1, *a.shape[2:])
 
-        merged = jax.tree.map(merge, tuple(batched[1:]), trees)
+        merged = jax.tree.map(merge, trees_batched, trees)
         if blocks is not None:
-            blocks = _merge_blocks(devices, size, batched[0], blocks)
-        found, left = mapped(blocks, *merged)
+            blocks = _merge_blocks(devices, size, blocks_batched, blocks)
+        found, left = call(blocks, *merged)
         found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
         flags = jax.tree.map(lambda _: True, found)
         if left is None:
@@ -358,7 +374,7 @@ def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[
         batched_runs: Any = True
         return (found, Blocks(left.arrays, runs)), (flags, Blocks(unbatched, batched_runs))
 
-    return mapped
+    return call
 
 
 def _merge_blocks(devices: Devices, size: int, batched: Blocks, blocks: Blocks) -> Blocks:

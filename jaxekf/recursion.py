@@ -7,7 +7,7 @@ again from the belief it started from: nothing but beliefs is kept.
 
 import math
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -337,7 +337,7 @@ def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[
     It is called with None or `Blocks` and with trees; it returns a tree and None or `Blocks`.
     """
 
-    @lru_cache(maxsize=None)
+    @cache
     def mapped(tree: Any) -> Any:
         # Arguments are leaves: the derivative of `custom_vmap` takes no None among them.
         flat = custom_vmap(lambda leaves: function(*jax.tree.unflatten(tree, leaves)))

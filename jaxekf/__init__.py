@@ -16,6 +16,7 @@ from jaxekf.errors import (
 )
 from jaxekf.estimation import estimate, estimate_many
 from jaxekf.interpolation import InputSample
+from jaxekf.kernels import jit
 from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
 from jaxekf.metrics import Score, score
 from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor
@@ -61,6 +62,7 @@ __all__ = [
     "estimate_many",
     "get_model",
     "initial_belief",
+    "jit",
     "load",
     "load_parameters",
     "manifold",

@@ -12,20 +12,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from jaxekf import patterned
+from jaxekf import linalg, patterned
 from jaxekf.kernels import loop
 from jaxekf.lanes import written_sum
 from jaxekf.patterned import Pattern
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 _PIVOTS_PER_LOG = 4
-
-
-def symmetric(matrix: Array) -> Array:
-    """The symmetric part, (n, n, lanes)."""
-    return 0.5 * (matrix + matrix.swapaxes(0, 1))
 
 
 def product(left: Array, right: Array) -> Array:
@@ -53,11 +48,6 @@ def outer(left: Array, right: Array) -> Array:
     return left[:, None] * right[None]
 
 
-def diagonal(matrix: Array) -> Array:
-    """Diagonal, (n, n, lanes) to (n, lanes)."""
-    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
-
-
 def on_diagonal(values: Array) -> Array:
     """Diagonal matrices, (n, lanes) to (n, n, lanes)."""
     eye = np.eye(values.shape[0], dtype=bool)[:, :, None]
@@ -71,7 +61,7 @@ def congruence(p: Pattern, block: Array | None, cov: Array) -> tuple[Array, Arra
     """``M P M'`` and ``M P``."""
     half = loop(partial(patterned.multiply, p), block, cov)
     whole = loop(lambda b, h: patterned.multiply(p, b, h, axis=1), block, half)
-    return symmetric(whole), half
+    return linalg.symmetrise(whole), half
 
 
 def _congruence_pullback(
@@ -105,7 +95,7 @@ def congruence_with_adjoint(p: Pattern) -> Any:
 
     def backward(saved: Any, cotangent: Array) -> Any:
         block, half = saved
-        return _congruence_pullback(p, block, half, loop(symmetric, cotangent))
+        return _congruence_pullback(p, block, half, loop(linalg.symmetrise, cotangent))
 
     function.defvjp(forward, backward)
     return function
@@ -172,56 +162,38 @@ def factor(size: int, column: Any, *args: Any) -> _Factor:
     return found
 
 
-def forward(factored: _Factor, right: list[Array]) -> list[Array]:
-    """Rows of ``inv(L) @ right``, L the unit lower factor; rows are (lanes,) or (n, lanes)."""
-    solved: list[Array] = []
+def solve(factored: _Factor, right: list[Array]) -> list[Array]:
+    """Rows of ``inv(S) @ right``; rows are (n, lanes)."""
+    lowered: list[Array] = []
     for i, row in enumerate(right):
 
-        def eliminate(row: Array, factored: _Factor, solved: list[Array], i: int = i) -> Array:
-            for k, earlier in enumerate(solved):
-                row = row - _scaled(factored.ratio(i, k), earlier)
+        def eliminate(row: Array, factored: _Factor, lowered: list[Array], i: int = i) -> Array:
+            for k, earlier in enumerate(lowered):
+                row = row - factored.ratio(i, k)[None] * earlier
             return row
 
-        solved.append(row if i == 0 else loop(eliminate, row, factored, solved))
-    return solved
-
-
-def backward(factored: _Factor, right: list[Array]) -> list[Array]:
-    """Rows of ``inv(S) @ right`` from what `forward` gave."""
+        lowered.append(row if i == 0 else loop(eliminate, row, factored, lowered))
     solved: list[Array] = []
     for i in reversed(range(len(right))):
 
         def substitute(row: Array, factored: _Factor, solved: list[Array], i: int = i) -> Array:
-            row = _scaled(factored.inverses[i], row)
+            row = factored.inverses[i][None] * row
             for k, later in zip(range(i + 1, len(right)), solved, strict=True):
-                row = row - _scaled(factored.ratio(k, i), later)
+                row = row - factored.ratio(k, i)[None] * later
             return row
 
-        solved.insert(0, loop(substitute, right[i], factored, solved))
+        solved.insert(0, loop(substitute, lowered[i], factored, solved))
     return solved
 
 
-def _scaled(factor: Array, row: Array) -> Array:
-    return factor * row if row.ndim == 1 else factor[None] * row
-
-
 class _Solved(NamedTuple):
-    """What an update and its derivative share; lists are over rows."""
+    """What an update and its derivative share; lists are over rows, each (columns, lanes)."""
 
     factored: _Factor
-    projected: list[Array]
-    """Rows of ``H P``, hidden ones zero, (n, lanes)."""
-    gain: list[Array]
-    """Columns of the gain K, (n, lanes)."""
-    residual: list[Array]
-    whitened: list[Array]
-    """Rows of ``inv(L) e``."""
-
-
-def hide(matrix: Array, mask: Array) -> Array:
-    """``matrix`` with hidden rows and columns as in the identity, (m, m, lanes), (m, lanes)."""
-    eye = jnp.asarray(np.eye(mask.shape[0])[:, :, None], matrix.dtype)
-    return jnp.where(mask[:, None] & mask[None], matrix, eye)
+    right: list[Array]
+    """``[H P | e]``, hidden rows zero; with one more unit row for each measured number for derivatives."""
+    solved: list[Array]
+    """``inv(S)`` times it: ``[K' | inv(S) e | inv(S)]``."""
 
 
 def innovation_covariance(p: Pattern, slope: Array | None, noise: Array, cov: Array) -> Array:
@@ -231,17 +203,27 @@ def innovation_covariance(p: Pattern, slope: Array | None, noise: Array, cov: Ar
     return spread + (on_diagonal(noise) if noise.ndim == 2 else noise)
 
 
-def _projected(p: Pattern, i: int, slope: Array | None, cov: Array, mask: Array) -> Array:
-    """Row i of ``H P``, zero where hidden."""
-    row = patterned.row(p, slope, i, cov)
-    return jnp.zeros_like(cov[0]) if row is None else jnp.where(mask[i][None], row, 0.0)
+def _right(
+    p: Pattern, i: int, with_inverse: bool, slope: Array | None, gained: Gained, rows: Rows
+) -> Array:
+    """Row i of ``[H P | e]``, zero where hidden, and of the identity beside it."""
+    row = patterned.row(p, slope, i, gained.cov)
+    row = jnp.zeros_like(gained.cov[0]) if row is None else row
+    moved = patterned.row(p, slope, i, gained.delta)
+    residual = rows.residual[i] if moved is None else rows.residual[i] - moved
+    seen = rows.mask[i][None]
+    parts = [jnp.where(seen, row, 0.0), jnp.where(seen, residual[None], 0.0)]
+    if with_inverse:
+        unit = np.eye(rows.mask.shape[0])[i][:, None]
+        parts.append(jnp.broadcast_to(jnp.asarray(unit, row.dtype), rows.mask.shape))
+    return lax.concatenate(parts, 0)
 
 
 def _innovation_column(
-    p: Pattern, j: int, slope: Array | None, projected: list[Array], noise: Array, mask: Array
+    p: Pattern, j: int, slope: Array | None, right: list[Array], noise: Array, mask: Array
 ) -> Array:
     """Rows j and later of column j of ``H P H' + R``, hidden rows as in the identity."""
-    value = patterned.multiply(p, slope, projected[j])[j:]
+    value = patterned.multiply(p, slope, right[j][: p.shape[1]])[j:]
     first = np.arange(mask.shape[0] - j)[:, None] == 0
     value = (
         value + jnp.where(first, noise[j][None], 0.0) if noise.ndim == 2 else value + noise[j:, j]
@@ -249,17 +231,12 @@ def _innovation_column(
     return jnp.where(mask[j:] & mask[j][None], value, first.astype(value.dtype))
 
 
-def _solve(p: Pattern, gained: Gained, rows: Rows) -> _Solved:
-    mask, slope = rows.mask, rows.slope
-    count = range(mask.shape[0])
-    projected = [loop(partial(_projected, p, i), slope, gained.cov, mask) for i in count]
+def _solve(p: Pattern, gained: Gained, rows: Rows, with_inverse: bool) -> _Solved:
+    count = range(rows.mask.shape[0])
+    right = [loop(partial(_right, p, i, with_inverse), rows.slope, gained, rows) for i in count]
     column = partial(_innovation_column, p)
-    factored = factor(len(count), column, slope, projected, rows.noise, mask)
-    moved = patterned.multiply(p, slope, gained.delta)
-    residual = jnp.where(mask, rows.residual - moved, 0.0)
-    gain = backward(factored, forward(factored, projected))
-    residuals = [residual[i] for i in count]
-    return _Solved(factored, projected, gain, residuals, forward(factored, residuals))
+    factored = factor(len(count), column, rows.slope, right, rows.noise, rows.mask)
+    return _Solved(factored, right, solve(factored, right))
 
 
 def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
@@ -267,7 +244,9 @@ def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
     return written_sum([outer(a, b) for a, b in zip(left, right, strict=True)])
 
 
-def _take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, _Solved]:
+def _take(
+    p: Pattern, gained: Gained, rows: Rows, with_inverse: bool = False
+) -> tuple[Gained, Array, _Solved]:
     """The state after a block of rows, their smallest pivot, and what the derivative needs.
 
     The covariance is symmetric but for rounding; its cotangent must be symmetric.
@@ -275,13 +254,14 @@ def _take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, _Solve
     The covariance is Joseph's ``(I - K H) P (I - K H)' + K R K'``, in the order ``half = P - K (H P)``,
     ``half + (K R - half H') K'``: a gain that is rounded then counts only to the second order.
     """
-    solved = _solve(p, gained, rows)
-    mask, noise, gain = rows.mask, rows.noise, solved.gain
+    found = _solve(p, gained, rows, with_inverse)
+    mask, noise, size = rows.mask, rows.noise, p.shape[1]
 
-    def half_way(cov: Array, gain: list[Array], projected: list[Array]) -> Array:
-        return cov - sum_of_outer(gain, projected)
+    def half_way(cov: Array, solved: list[Array], right: list[Array]) -> Array:
+        return cov - sum_of_outer([k[:size] for k in solved], [r[:size] for r in right])
 
-    def remainder(half: Array, slope: Array | None, gain: list[Array], i: int) -> Array:
+    def remainder(half: Array, slope: Array | None, solved: list[Array], i: int) -> Array:
+        gain = [k[:size] for k in solved]
         if noise.ndim == 2:
             spread = gain[i] * noise[i][None]
         else:
@@ -289,28 +269,29 @@ def _take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, _Solve
         seen = patterned.row(p, slope, i, half, axis=1)
         return jnp.where(mask[i][None], spread if seen is None else spread - seen, 0.0)
 
-    def finish(half: Array, rest: list[Array], gain: list[Array]) -> Array:
-        return half + sum_of_outer(rest, gain)
+    def finish(half: Array, rest: list[Array], solved: list[Array]) -> Array:
+        return half + sum_of_outer(rest, [k[:size] for k in solved])
 
-    half = loop(half_way, gained.cov, gain, solved.projected)
-    rest = [loop(partial(remainder, i=i), half, rows.slope, gain) for i in range(mask.shape[0])]
-    cov = loop(finish, half, rest, gain)
+    half = loop(half_way, gained.cov, found.solved, found.right)
+    count = range(mask.shape[0])
+    rest = [loop(partial(remainder, i=i), half, rows.slope, found.solved) for i in count]
+    cov = loop(finish, half, rest, found.solved)
 
-    def move(delta: Array, gain: list[Array], residual: list[Array]) -> Array:
-        return delta + written_sum([g * r[None] for g, r in zip(gain, residual, strict=True)])
+    def move(delta: Array, solved: list[Array], right: list[Array]) -> Array:
+        pairs = zip(solved, right, strict=True)
+        return delta + written_sum([k[:size] * r[size][None] for k, r in pairs])
 
-    delta = loop(move, gained.delta, gain, solved.residual)
-    log_likelihood = gained.log_likelihood - 0.5 * loop(_surprise, solved, mask)
-    smallest = loop(lambda pivots: reduce(jnp.minimum, pivots), solved.factored.pivots)
-    return Gained(cov, delta, log_likelihood), smallest, solved
+    delta = loop(move, gained.delta, found.solved, found.right)
+    log_likelihood = gained.log_likelihood - 0.5 * loop(partial(_surprise, size), found, mask)
+    smallest = loop(lambda pivots: reduce(jnp.minimum, pivots), found.factored.pivots)
+    return Gained(cov, delta, log_likelihood), smallest, found
 
 
-def _surprise(solved: _Solved, mask: Array) -> Array:
-    """``e' inv(S) e + log det (2 pi S)`` of the rows that count."""
-    factored = solved.factored
-    squares = [w * w * i for w, i in zip(solved.whitened, factored.inverses, strict=True)]
+def _surprise(size: int, found: _Solved, mask: Array) -> Array:
+    """``e' inv(S) e + log det (2 pi S)`` of the rows that count; `size` columns before e."""
+    squares = [s[size] * r[size] for s, r in zip(found.solved, found.right, strict=True)]
     # Few logarithms: pivots are multiplied first, few enough that no product over- or underflows.
-    pivots = factored.pivots
+    pivots = found.factored.pivots
     products = [
         reduce(operator.mul, pivots[i : i + _PIVOTS_PER_LOG])
         for i in range(0, len(pivots), _PIVOTS_PER_LOG)
@@ -322,89 +303,99 @@ def _surprise(solved: _Solved, mask: Array) -> Array:
 def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
     """Take a block of rows; also the smallest pivot, positive where all went well.
 
-    The covariance is symmetric but for rounding, and `symmetric` is left to the caller.
+    The covariance is symmetric but for rounding, and making it exactly so is left to the caller.
     """
     after, smallest, _ = _take(p, gained, rows)
     return after, smallest
 
 
+class _Saved(NamedTuple):
+    """What the derivative of an update needs of it."""
+
+    cov: Array
+    """P after it."""
+    delta: Array
+    solved: Array
+    """``[K' | inv(S) e | inv(S)]``, (rows, columns, lanes)."""
+    slope: Array | None
+    mask: Array
+
+
 def _update_pullback(
-    p: Pattern, saved: tuple[Gained, Rows, _Solved], cotangent: Gained
+    p: Pattern, diagonal: bool, saved: _Saved, cotangent: Gained
 ) -> tuple[Gained, Rows]:
     """Cotangents of what went into `update` from those of what came out."""
-    after, rows, solved = saved
-    mask, slope, factored = rows.mask, rows.slope, solved.factored
-    count = mask.shape[0]
+    mask, slope, solved, size = saved.mask, saved.slope, saved.solved, p.shape[1]
     back, turned = p.transposed, patterned.transpose(slope)
-    b = cotangent.cov
-    a, weight = cotangent.delta, cotangent.log_likelihood
-    gain = jnp.stack(solved.gain, axis=1)
-    scaled = jnp.stack(backward(factored, solved.whitened))
-    eye = np.eye(count)[:, :, None]
-    unit = [jnp.broadcast_to(jnp.asarray(eye[i]), mask.shape) for i in range(count)]
-    inverse = jnp.stack(backward(factored, forward(factored, unit)))
-    lowered = loop(lambda gain, a: apply(gain.swapaxes(0, 1), a), gain, a)
-    error = lowered - weight[None] * scaled
+    b, a, weight = cotangent.cov, cotangent.delta, cotangent.log_likelihood
+    both = mask[:, None] & mask[None]
+    lowered = loop(lambda solved, a: apply(solved[:, :size], a), solved, a)  # K' a
 
-    def information(scaled: Array, inverse: Array, weight: Array) -> Array:
-        whole = (0.5 * weight)[None, None] * (outer(scaled, scaled) - inverse)
-        return jnp.where(mask[:, None] & mask[None], whole, 0.0)
+    def error_of(lowered: Array, solved: Array, weight: Array) -> Array:
+        return lowered - weight[None] * solved[:, size]
 
-    info = loop(information, scaled, inverse, weight)
-    turned_b = loop(transposed_product, gain, b)  # K' B
+    error = loop(error_of, lowered, solved, weight)
+    turned_b = loop(lambda solved, b: product(solved[:, :size], b), solved, b)  # K' B
 
-    def of_noise(turned_b: Array, gain: Array, lowered: Array, scaled: Array, info: Array) -> Array:
-        if rows.noise.ndim == 2:
-            spread = written_sum([turned_b[:, k] * gain[k] for k in range(gain.shape[0])])
-            return spread - lowered * scaled + diagonal(info)
-        return product(turned_b, gain) - symmetric(outer(lowered, scaled)) + info
+    # N = K' B K + M, M the information: w / 2 (s s' - inv(S)).
+    def inner_of(turned_b: Array, solved: Array, weight: Array, both: Array) -> Array:
+        scaled = solved[:, size]
+        info = (0.5 * weight)[None, None] * (outer(scaled, scaled) - solved[:, size + 1 :])
+        return product_transposed(turned_b, solved[:, :size]) + jnp.where(both, info, 0.0)
 
-    noise = loop(of_noise, turned_b, gain, lowered, scaled, info)
-    noise = jnp.where(mask if noise.ndim == 2 else mask[:, None] & mask[None], noise, 0.0)
+    inner = loop(inner_of, turned_b, solved, weight, both)
+
+    def of_noise(inner: Array, lowered: Array, solved: Array, mask: Array, both: Array) -> Array:
+        if diagonal:
+            return jnp.where(mask, linalg.diagonal(inner) - lowered * solved[:, size], 0.0)
+        return jnp.where(both, inner - linalg.symmetrise(outer(lowered, solved[:, size])), 0.0)
+
+    noise = loop(of_noise, inner, lowered, solved, mask, both)
     pulled = a - loop(partial(patterned.multiply, back), turned, lowered)  # A' a
 
-    # With N = K' B K + M the whole is B - H' T - T' H,  T = K' B - N H / 2 - s (A' a)' / 2.
+    # The whole is B - H' T - T' H,  T = K' B - N H / 2 - s (A' a)' / 2.
     def half(
-        slope: Array | None, inner: Array, turned_b: Array, scaled: Array, pulled: Array
+        slope: Array | None, inner: Array, turned_b: Array, solved: Array, pulled: Array
     ) -> Array:
         drawn = patterned.multiply(p.transposed, patterned.transpose(slope), inner, axis=1)
-        return turned_b - 0.5 * (drawn + outer(scaled, pulled))
+        return turned_b - 0.5 * (drawn + outer(solved[:, size], pulled))
 
-    inner = loop(lambda turned_b, gain, info: product(turned_b, gain) + info, turned_b, gain, info)
-    spread = loop(half, slope, inner, turned_b, scaled, pulled)
+    spread = loop(half, slope, inner, turned_b, solved, pulled)
     whole = loop(partial(patterned.multiply, back), turned, spread)
     cov = loop(lambda b, w: b - w - w.swapaxes(0, 1), b, whole)
     delta = a - loop(partial(patterned.multiply, back), turned, error)
     slope_bar = None
     if slope is not None:
 
-        def of_slope(scaled: Array, a: Array, error: Array, turned_b: Array, gain: Array) -> Array:
-            used = patterned.take(after.cov, p.cols, 1)
+        def of_slope(saved: _Saved, a: Array, error: Array, turned_b: Array) -> Array:
+            used = patterned.take(saved.cov, p.cols, 1)
             pa = apply(used.swapaxes(0, 1), a)
-            moved = patterned.take(after.delta, p.cols, 0)
-            whole = outer(scaled, pa) - outer(error, moved) - 2.0 * product(turned_b, used)
-            whole = whole - weight[None, None] * patterned.take(gain, p.cols, 0).swapaxes(0, 1)
+            moved = patterned.take(saved.delta, p.cols, 0)
+            gain = patterned.take(saved.solved, p.cols, 1)
+            whole = outer(saved.solved[:, size], pa) - outer(error, moved)
+            whole = whole - 2.0 * product(turned_b, used) - weight[None, None] * gain
             whole = jnp.where(mask[:, None], whole, 0.0)
             return patterned.take(whole, p.rows, 0)
 
-        slope_bar = loop(of_slope, scaled, a, error, turned_b, gain)
+        slope_bar = loop(of_slope, saved, a, error, turned_b)
     return Gained(cov, delta, weight), Rows(error, slope_bar, noise, mask)
 
 
 @cache
-def update_with_adjoint(p: Pattern) -> Any:
-    """`update` of (gained, rows) with its derivative in closed form."""
+def update_with_adjoint(p: Pattern, diagonal: bool) -> Any:
+    """`update` of (gained, rows) with its derivative in closed form; whether the noise is diagonal."""
 
     @jax.custom_vjp
     def function(gained: Gained, rows: Rows) -> tuple[Gained, Array]:
         return update(p, gained, rows)
 
     def forward(gained: Gained, rows: Rows) -> Any:
-        after, smallest, solved = _take(p, gained, rows)
-        return (after, smallest), (after, rows, solved)
+        after, smallest, found = _take(p, gained, rows, with_inverse=True)
+        solved = loop(jnp.stack, found.solved)
+        return (after, smallest), _Saved(after.cov, after.delta, solved, rows.slope, rows.mask)
 
     def backward(saved: Any, cotangent: Any) -> Any:
-        gained, rows = _update_pullback(p, saved, cotangent[0])
+        gained, rows = _update_pullback(p, diagonal, saved, cotangent[0])
         return gained, rows._replace(mask=np.zeros(rows.mask.shape, jax.dtypes.float0))
 
     function.defvjp(forward, backward)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf import linalg, recursion, system
+from jaxekf import blocks, linalg, recursion, system
 from jaxekf.errors import ModelError
 from jaxekf.interpolation import InputSample, sample
 from jaxekf.linearise import linearise_sensor
@@ -131,9 +131,7 @@ def run_filter_batch(
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     inputs = jax.vmap(partial(inputs_of, model))(params, steps)
-    sizes: Any = jax.tree.map(
-        lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), (params, belief.mean)
-    )
+    sizes: Any = _one_sample((params, belief.mean), 1)
     u, fast = _one_sample((inputs, steps.fast), 3)
     ready = system.build(model, sizes[0], sizes[1], u, fast | _one_sample(steps.slow, 2))
     prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
@@ -142,7 +140,7 @@ def run_filter_batch(
     if adjoint:
         runs, epochs = steps.dt.shape[:2]
         kept_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
-        lanes = min(runs, recursion.LANES)
+        lanes = min(runs, blocks.LANES)
         segment = recursion.segment_length(epochs, kept_bytes * lanes)
         if not checkpoint:
             segment = 1
@@ -205,5 +203,5 @@ def _innovation(
     spread = linalg.multiply_transposed(linalg.multiply(jacobian, prior.cov), jacobian)
     noise = linalg.mask_covariance(noise, rows.mask)
     cov = linalg.symmetrise(spread + noise)
-    white = linalg.whiten(linalg.whitener(cov), residual)
-    return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, jnp.sum(white * white))
+    nis = linalg.squared_distance(residual, cov)
+    return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, nis)

@@ -14,6 +14,7 @@ from jax import Array
 from jaxekf import ekf, manifold, padding, parameters, storage, timeline
 from jaxekf.ekf import FilterOutput
 from jaxekf.errors import FilterError, PrecisionError
+from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.models import get_model
 from jaxekf.recording import NANOSECONDS, Recording
@@ -102,7 +103,7 @@ def sharing_devices() -> tuple[Any, ...]:
     return tuple(devices) if shared else ()
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jit, static_argnums=(0, 1))
 def _run(
     model: Model, devices: tuple[Any, ...], params: Parameters, means: Any, steps: Steps
 ) -> Any:

@@ -14,6 +14,11 @@ def symmetrise(matrix: Array) -> Array:
     return 0.5 * (matrix + matrix.swapaxes(0, 1))
 
 
+def diagonal(matrix: Array) -> Array:
+    """Diagonal, (n, n, ...) to (n, ...)."""
+    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
+
+
 def multiply(left: Array, right: Array) -> Array:
     """Matrix product, shapes (i, k, ...), (k, j, ...) to (i, j, ...)."""
     return jnp.sum(left[:, :, None] * right[None], axis=1)
@@ -104,3 +109,12 @@ def whiten(white: tuple[Array, Array], right: Array) -> Array:
             value = value - factor[i, k] * solved[k]
         solved.append(value * inverses[i])
     return jnp.stack(solved)
+
+
+def squared_distance(residual: Array, cov: Array) -> Array:
+    """``r' inv(S) r``, shapes (m, ...), (m, m, ...) to (...)."""
+    white = whiten(whitener(cov), residual)
+    total = white[0] * white[0]
+    for w in white[1:]:
+        total = total + w * w
+    return total

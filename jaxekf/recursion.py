@@ -7,23 +7,21 @@ again from the belief it started from: nothing but beliefs is kept.
 
 import math
 from collections.abc import Callable
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
 from jaxekf import kernels
+from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
-from jaxekf.step import Moment, Outcome, advance
+from jaxekf.step import Moment, Outcome, predict, update
 from jaxekf.system import System
 
-LANES = 16
-"""Runs in a block: wide enough to fill vector registers, small enough to stay in the first cache."""
 _LARGEST_UNROLLED_SUBSTEPS = 2
 _CACHE_BYTES = 1 << 21
 _MEMORY_BYTES = 1 << 32
@@ -75,21 +73,33 @@ def _epoch(
     system: System, what: What, adjoint: bool, prepared: Any, belief: Belief, given: Given
 ) -> tuple[Belief, Kept]:
     """All substeps of one epoch; slow sensors are taken at the last."""
-    every = (given.moments, given.fast)
+    count = given.moments.dt.shape[0] - 1
 
-    def substep(belief: Belief, moment: Moment, samples: Any) -> tuple[Belief, Kept]:
-        outcome = advance(system, prepared, belief, moment, samples, adjoint=adjoint)
+    def ahead(belief: Belief, moment: Moment) -> Belief:
+        return predict(system, prepared, belief, moment, adjoint=adjoint)
+
+    def take(prior: Belief, u: Any, samples: Any) -> tuple[Belief, Kept]:
+        outcome = update(system, prepared, prior, u, samples, adjoint=adjoint)
         return outcome.posterior, _keep(what, outcome)
 
-    count = given.moments.dt.shape[0] - 1
+    def substep(belief: Belief, at: Any) -> tuple[Belief, Kept]:
+        moment, samples = at
+        return take(ahead(belief, moment), moment.u, samples)
+
+    every = (given.moments, given.fast)
     moment, fast = jax.tree.map(lambda a: a[-1], every)
-    if count == 0:
-        belief, last = substep(belief, moment, fast | given.slow)
-        return belief, _gathered(None, last, given.slow)
-    before = jax.tree.map(lambda a: a[:-1], every)
-    unroll = count <= _LARGEST_UNROLLED_SUBSTEPS
-    belief, earlier = lax.scan(lambda b, g: substep(b, *g), belief, before, unroll=unroll)
-    belief, last = substep(belief, moment, fast | given.slow)
+    if count and not given.fast:
+        # One scan over all predictions: the transition is compiled once, not twice.
+        prior, kept = lax.scan(substep, belief, every)
+        belief, last = take(prior, moment.u, given.slow)
+        earlier = jax.tree.map(lambda a: a[:-1], kept)
+        return belief, _gathered(earlier, last, given.slow)
+    earlier = None
+    if count:
+        before = jax.tree.map(lambda a: a[:-1], every)
+        unroll = count <= _LARGEST_UNROLLED_SUBSTEPS
+        belief, earlier = lax.scan(substep, belief, before, unroll=unroll)
+    belief, last = take(ahead(belief, moment), moment.u, fast | given.slow)
     return belief, _gathered(earlier, last, given.slow)
 
 
@@ -245,160 +255,6 @@ def _merge(flags: Any, chosen: list[Any], others: list[Any]) -> list[Any]:
 # --- all runs -----------------------------------------------------------------------------------------
 
 
-class Blocks(NamedTuple):
-    """Arrays as the scans leave them: (blocks, ..., lanes), the last block filled up.
-
-    They stay so from the forward to the backward pass; to put the runs first and back would cost as
-    much as the filter. `runs` (runs,) says how many runs they are, and of which `vmap`.
-    """
-
-    arrays: Any
-    runs: Array
-
-
-Devices = tuple[Any, ...]
-"""Devices that share the runs; none for the one that JAX chooses."""
-
-
-def _blocks(runs: int, devices: Devices) -> tuple[int, int]:
-    """Number of blocks, the same for each device, and their width."""
-    size = min(runs, LANES)
-    count = -(-runs // size)
-    return count + -count % max(_shared(count, devices), 1), size
-
-
-def _shared(count: int, devices: Devices) -> int:
-    """How many of the devices share `count` blocks; 0 where there is nothing to share."""
-    return min(count, len(devices)) if count > 1 and len(devices) > 1 else 0
-
-
-def _cut_runs(tree: Any, devices: Devices) -> Any:
-    """Arrays (runs, ...) as (blocks, lanes, ...), the last run repeated to fill the last blocks."""
-
-    def cut(a: Array) -> Array:
-        count, size = _blocks(a.shape[0], devices)
-        more = count * size - a.shape[0]
-        if more:
-            a = jnp.concatenate([a, jnp.broadcast_to(a[-1:], (more, *a.shape[1:]))])
-        return a.reshape(count, size, *a.shape[1:])
-
-    return jax.tree.map(cut, tree)
-
-
-def _join_runs(tree: Any, runs: int) -> Any:
-    """The inverse of `_cut_runs`."""
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:runs], tree)
-
-
-def _lanes_last(tree: Any) -> Any:
-    return jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), tree)
-
-
-def _lanes_first(tree: Any) -> Any:
-    return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), tree)
-
-
-def _in_blocks(
-    devices: Devices, function: Callable[..., Any], blocked: Any, *trees: Any
-) -> tuple[Any, Any]:
-    """``function`` of trees with lanes last, for runs on the first axis in blocks of `LANES`.
-
-    It is called with `blocked`, which is in blocks already, and `trees`; of its two results the first is
-    put back to runs, the second is left in blocks.
-    """
-    runs = jax.tree.leaves(trees)[0].shape[0]
-
-    def one(given: Any) -> Any:
-        blocked, trees = given
-        first, second = function(blocked, *_lanes_last(trees))
-        return _lanes_first(first), second
-
-    given = (blocked, _cut_runs(trees, devices))
-    count = _blocks(runs, devices)[0]
-    shared = _shared(count, devices)
-    if count == 1:
-        found = one(jax.tree.map(lambda a: a[0], given))
-        first, second = jax.tree.map(lambda a: a[None], found)
-    elif shared:
-        mesh = jax.sharding.Mesh(np.array(devices[:shared]), ("runs",))
-        along = jax.sharding.PartitionSpec("runs")
-        split = jax.shard_map(
-            partial(lax.map, one), mesh=mesh, in_specs=along, out_specs=along, check_vma=False
-        )
-        first, second = split(given)
-    else:
-        first, second = lax.map(one, given)
-    return _join_runs(first, runs), second
-
-
-def _over_more_runs(devices: Devices, function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of runs on the first axis, whose `vmap` is the same function of more runs.
-
-    It is called with None or `Blocks` and with trees; it returns a tree and None or `Blocks`.
-    """
-
-    @cache
-    def mapped(tree: Any) -> Any:
-        # Arguments are leaves: the derivative of `custom_vmap` takes no None among them.
-        flat = custom_vmap(lambda leaves: function(*jax.tree.unflatten(tree, leaves)))
-        flat.def_vmap(partial(rule, tree))
-        return flat
-
-    def call(blocks: Blocks | None, *trees: Any) -> Any:
-        leaves, tree = jax.tree.flatten((blocks, *trees))
-        return mapped(tree)(leaves)
-
-    def rule(tree: Any, size: int, batched: Any, leaves: Any) -> Any:
-        blocks, *trees = jax.tree.unflatten(tree, leaves)
-        if not any(jax.tree.leaves(batched)):
-            # A derivative is taken in several directions at once: the runs are as many as before.
-            found = function(blocks, *trees)
-            return found, jax.tree.map(lambda _: False, found)
-        blocks_batched, *trees_batched = jax.tree.unflatten(tree, *batched)
-
-        def merge(flag: bool, a: Array) -> Array:
-            if not flag:
-                a = jnp.broadcast_to(a, (size, *a.shape))
-            return a.reshape(-1, *a.shape[2:])
-
-        merged = jax.tree.map(merge, trees_batched, trees)
-        if blocks is not None:
-            blocks = _merge_blocks(devices, size, blocks_batched, blocks)
-        found, left = call(blocks, *merged)
-        found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
-        flags = jax.tree.map(lambda _: True, found)
-        if left is None:
-            return (found, None), (flags, None)
-        runs = left.runs.reshape(size, -1)
-        unbatched = jax.tree.map(lambda _: False, left.arrays)
-        batched_runs: Any = True
-        return (found, Blocks(left.arrays, runs)), (flags, Blocks(unbatched, batched_runs))
-
-    return call
-
-
-def _merge_blocks(devices: Devices, size: int, batched: Blocks, blocks: Blocks) -> Blocks:
-    """Blocks of all runs of a `vmap` of the given size."""
-    runs = blocks.runs.reshape(-1) if batched.runs else jnp.tile(blocks.runs, size)
-    if batched.runs and not any(jax.tree.leaves(batched.arrays)):
-        # Made under the same `vmap`: the blocks hold the runs of all its members already.
-        return Blocks(blocks.arrays, runs)
-    count = runs.shape[0] // size
-
-    def merge(flag: bool, a: Array) -> Array:
-        def spread(a: Array) -> Array:
-            return _join_runs(jnp.moveaxis(a, -1, 1), count)
-
-        a = (
-            jax.vmap(spread)(a)
-            if flag
-            else jnp.broadcast_to(spread(a), (size, count, *a.shape[1:-1]))
-        )
-        return jnp.moveaxis(_cut_runs(a.reshape(-1, *a.shape[2:]), devices), 1, -1)
-
-    return Blocks(jax.tree.map(merge, batched.arrays, blocks.arrays), runs)
-
-
 def _whole(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
     """The function as one piece of code where the model allows it."""
     return partial(kernels.block, function) if system.is_plain else function
@@ -415,7 +271,7 @@ def filter_plainly(
             epoch = jax.checkpoint(epoch)
         return lax.scan(epoch, belief, given)[1], None
 
-    return _in_blocks((), runs, None, prepared, belief, given)[0]
+    return in_blocks((), runs, None, prepared, belief, given)[0]
 
 
 def filter_with_adjoint(
@@ -439,13 +295,13 @@ def _with_adjoint(
         def scan(_: None, *trees: Any) -> Any:
             return _scan(system, what, False, segment, *trees)
 
-        kept, starts = _in_blocks(devices, _whole(system, scan), None, *trees)
+        kept, starts = in_blocks(devices, _whole(system, scan), None, *trees)
         if segment is None:
             return kept, None
         return kept, Blocks(starts, jnp.zeros(jax.tree.leaves(trees)[0].shape[0]))
 
-    ahead = _over_more_runs(devices, partial(run, None))
-    ahead_saving = _over_more_runs(devices, partial(run, segment))
+    ahead = over_more_runs(devices, partial(run, None))
+    ahead_saving = over_more_runs(devices, partial(run, segment))
 
     @jax.custom_vjp
     def function(prepared: Any, belief: Belief, given: Given) -> Kept:
@@ -488,7 +344,7 @@ def _backward(
         return _scan_back(system, what, segment, moving, live, starts, *trees), None
 
     def run(starts: Blocks, *trees: Any) -> Any:
-        count, size = _blocks(jax.tree.leaves(trees)[0].shape[0], devices)
+        count, size = shape_of(jax.tree.leaves(trees)[0].shape[0], devices)
 
         def fitting(a: Array) -> Array:
             # `custom_vmap` traces this for one member of a `vmap` before it asks for all of them, and
@@ -498,9 +354,9 @@ def _backward(
             return jnp.zeros((count, *a.shape[1:-1], size), a.dtype)
 
         arrays = jax.tree.map(fitting, starts.arrays)
-        return _in_blocks(devices, _whole(system, scan), arrays, *trees)
+        return in_blocks(devices, _whole(system, scan), arrays, *trees)
 
-    return _over_more_runs(devices, run)
+    return over_more_runs(devices, run)
 
 
 def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:

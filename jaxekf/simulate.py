@@ -14,7 +14,7 @@ from jax import Array, lax
 from scipy.spatial.transform import Rotation
 
 from jaxekf import manifold
-from jaxekf.interpolation import sample as sample_input
+from jaxekf.ekf import inputs_of
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import (
     NANOSECONDS,
@@ -210,11 +210,7 @@ def draw(
     `steps` with the sampled values in place. Works under `vmap`.
     """
     steps = jax.tree.map(jnp.asarray, steps)
-    inputs = None
-    if model.input is not None and steps.knots is not None:
-        shift = model.input.clock_offset
-        offset = shift(params) if shift is not None else jnp.zeros(())
-        inputs = sample_input(steps.knots, steps.time, steps.dt, offset)
+    inputs = inputs_of(model, params, steps)
 
     def measure(x: Any, u: Any, rows: dict[str, Any], key: Array) -> dict[str, Any]:
         values = {}

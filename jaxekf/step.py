@@ -12,7 +12,7 @@ from jaxekf.algebra import Gained
 from jaxekf.lanes import written_sum
 from jaxekf.model import Belief, Sensor
 from jaxekf.patterned import Pattern
-from jaxekf.system import Measurement, System, Transition
+from jaxekf.system import Measurement, System
 from jaxekf.timeline import Rows
 
 _LARGEST_BLOCK = 7
@@ -44,27 +44,45 @@ class _Linear(NamedTuple):
     rows: algebra.Rows
 
 
-def advance(
-    system: System,
-    prepared: Any,
-    belief: Belief,
-    moment: Moment,
-    samples: dict[str, Rows],
-    *,
-    adjoint: bool,
-) -> Outcome:
-    """Predict to the end of one substep and take every sensor sampled there.
+def predict(
+    system: System, prepared: Any, belief: Belief, moment: Moment, *, adjoint: bool
+) -> Belief:
+    """The belief at the end of the substep: ``P = F P F' + G Sigma G'``.
 
     With `adjoint` reverse derivatives are the closed forms of `jaxekf.algebra`; without, every
     derivative is JAX's own.
     """
-    prior = _predict(system.transition, prepared["transition"], belief, moment, adjoint)
+    transition = system.transition
+    mean, f, g, sigma = transition.piece(
+        prepared["transition"], belief.mean, moment.u, moment.dt, adjoint=adjoint
+    )
+    cov = _congruence(transition.state, f, belief.cov, adjoint)
+    direct = transition.noise.is_identity
+    if transition.diagonal:
+        sigma = algebra.on_diagonal(sigma)
+    elif direct:
+        sigma = linalg.symmetrise(sigma)
+    return Belief(
+        mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint))
+    )
+
+
+def update(
+    system: System,
+    prepared: Any,
+    prior: Belief,
+    u: Any,
+    samples: dict[str, Rows],
+    *,
+    adjoint: bool,
+) -> Outcome:
+    """Take every sensor sampled at the end of a substep; `adjoint` as in `predict`."""
     linear: dict[str, _Linear] = {}
     gated: dict[str, Array] = {}
     for name, sample in samples.items():
         measurement = system.measurements[name]
         constants = prepared[f"sensor {name}"]
-        found: Any = measurement.piece(constants, prior.mean, moment.u, sample, adjoint=adjoint)
+        found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
         residual, slope, noise = found
         one = _hide(measurement, residual, slope, noise, sample.mask)
         gated[name] = _gate(measurement.sensor, one, prior.cov)
@@ -101,24 +119,6 @@ def _congruence(p: Pattern, block: Array | None, cov: Array, adjoint: bool) -> A
     return algebra.congruence(p, block, cov)[0]
 
 
-def _predict(
-    transition: Transition, constants: Any, belief: Belief, moment: Moment, adjoint: bool
-) -> Belief:
-    """The belief at the end of the substep: ``P = F P F' + G Sigma G'``."""
-    mean, f, g, sigma = transition.piece(
-        constants, belief.mean, moment.u, moment.dt, adjoint=adjoint
-    )
-    cov = _congruence(transition.state, f, belief.cov, adjoint)
-    direct = transition.noise.is_identity
-    if transition.diagonal:
-        sigma = algebra.on_diagonal(sigma)
-    elif direct:
-        sigma = algebra.symmetric(sigma)
-    return Belief(
-        mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint))
-    )
-
-
 def _hide(
     measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
 ) -> _Linear:
@@ -135,19 +135,13 @@ def _without(linear: _Linear, gated: Array) -> _Linear:
     return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
 
 
-def squared_distance(residual: Array, cov: Array) -> Array:
-    """``r' inv(S) r`` of a few rows on lanes."""
-    white = linalg.whiten(linalg.whitener(cov), residual)
-    return written_sum([w * w for w in white])
-
-
 def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
     """Visible rows whose group lies outside its chi-square bound."""
     rows = linear.rows
     if sensor.gate is None:
         return jnp.zeros_like(rows.mask)
     cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
-    cov = algebra.hide(cov, rows.mask)
+    cov = linalg.mask_covariance(cov, rows.mask)
     outside: list[Any] = [None] * sensor.rows
     for members in sensor.group_rows:
         residual = jnp.stack([rows.residual[i] for i in members])
@@ -155,7 +149,7 @@ def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
         freedom = np.arange(1, len(members) + 1)
         bounds = np.concatenate([[np.inf], chi2.ppf(sensor.gate, freedom)])
         visible = written_sum([rows.mask[i].astype(int) for i in members])
-        distance = squared_distance(residual, shared)
+        distance = linalg.squared_distance(residual, shared)
         bound = jnp.asarray(bounds[0], distance.dtype)
         for count in freedom:
             bound = jnp.where(visible == count, bounds[count], bound)
@@ -170,7 +164,7 @@ def _take(
     slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool
 ) -> tuple[Gained, Array]:
     if adjoint:
-        return algebra.update_with_adjoint(slope)(gained, rows)
+        return algebra.update_with_adjoint(slope, rows.noise.ndim == 2)(gained, rows)
     return algebra.update(slope, gained, rows)
 
 
@@ -232,7 +226,7 @@ def _correct(
     mean, reset = correction.piece(constants, prior.mean, gained.delta, any_used, adjoint=adjoint)
     cov = gained.cov
     if correction.reset.is_identity:
-        cov = algebra.symmetric(cov)
+        cov = linalg.symmetrise(cov)
     else:
         cov = _congruence(correction.reset, reset, cov, adjoint)
     return Belief(mean, jnp.where(any_used[None, None], cov, prior.cov))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import lanes, linearise, manifold, patterned, programs, scalars, structure
+from jaxekf import linalg, linearise, manifold, patterned, programs, scalars, structure
 from jaxekf.model import Model, Sensor
 from jaxekf.patterned import Pattern
 from jaxekf.programs import Program
@@ -22,11 +22,15 @@ from jaxekf.programs import Program
 class Piece:
     """A function of one run, split into what depends on the parameters only and what is done each step."""
 
+    is_plain: bool
+    """Whether the work of a step is arithmetic only."""
+
     def __init__(self, function: Callable[..., Any], params: Any, *rest: Any) -> None:
         program = programs.trace(function, params, *rest)
         self._head, body = programs.split(program, len(jax.tree.leaves(params)))
         count = len(self._head.outputs)
-        self._used = scalars.used(body, count)
+        numbers, self.is_plain = scalars.numbers_of(body)
+        self._used = scalars.used(numbers, count)
         self._body = _compact(body, count, self._used)
         self._on_lanes = partial(_on_lanes, self._body)
         self._pullback: Program | None = None
@@ -41,11 +45,6 @@ class Piece:
             for value, used in zip(values, self._used, strict=True)
             if used
         )
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the work of a step is arithmetic only."""
-        return lanes.is_plain(self._body)
 
     def __call__(self, prepared: Any, *rest: Any, adjoint: bool = False) -> Any:
         """The function on lanes; with `adjoint` its reverse derivative is one on lanes too."""
@@ -128,8 +127,6 @@ class Measurement(NamedTuple):
     piece: Piece
     """``(params, x, u, rows)`` to the residual, the unknown block of H, and the noise."""
     slope: Pattern
-    chunks: tuple[tuple[int, int], ...]
-    """Rows that no correlation of the noise ties to others, as ranges."""
     diagonal: bool
 
 
@@ -194,10 +191,6 @@ def _is_diagonal(matrix: structure.Known) -> bool:
     return bool(np.all(matrix.is_zero() | np.eye(matrix.value.shape[0], dtype=bool)))
 
 
-def _diagonal(matrix: Array) -> Array:
-    return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
-
-
 def _unknown_block(jacobian: Array, p: Pattern) -> Array | None:
     """Rows of the unknown block, of a Jacobian that has the block's columns only."""
     return patterned.take(jacobian, p.rows, 0) if p.rows else None
@@ -215,7 +208,7 @@ def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
             model, params, x, u, dt, state.cols, noise.cols
         )
         sigma = model.process_noise(params, dt)
-        sigma = _diagonal(sigma) if diagonal else sigma
+        sigma = linalg.diagonal(sigma) if diagonal else sigma
         return predicted, _unknown_block(f, state), _unknown_block(g, noise), sigma
 
     return Transition(Piece(step, params, x, u, dt), state, noise, diagonal)
@@ -226,25 +219,17 @@ def _measurement(
 ) -> Measurement:
     whole = _known(partial(linearise.linearise_sensor, model, sensor), params, x, u, rows)
     slope = patterned.pattern(whole[1])
-    tied = ~whole[2].is_zero()
     diagonal = _is_diagonal(whole[2])
 
     def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
         residual, h, noise = linearise.linearise_sensor(
             model, sensor, params, x, u, rows, slope.cols
         )
-        noise = _diagonal(noise) if diagonal else noise
+        noise = linalg.diagonal(noise) if diagonal else noise
         return residual, _unknown_block(h, slope), noise
 
     piece = Piece(sample, params, x, u, rows)
-    return Measurement(sensor, piece, slope, _untied(tied), diagonal)
-
-
-def _untied(tied: Any) -> tuple[tuple[int, int], ...]:
-    """The finest ranges of rows between which nothing is correlated."""
-    size = tied.shape[0]
-    cuts = [0] + [i for i in range(1, size) if not (tied[:i, i:].any() or tied[i:, :i].any())]
-    return tuple(zip(cuts, [*cuts[1:], size], strict=True))
+    return Measurement(sensor, piece, slope, diagonal)
 
 
 def _correction(model: Model, params: Any, x: Any) -> Correction:

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
-from jaxekf import ekf, get_model, manifold, metrics, rotation, simulate
+from jaxekf import ekf, get_model, jit, manifold, metrics, rotation, simulate
 from jaxekf.estimation import estimate_many
 from jaxekf.model import Belief
 from jaxekf.parameters import as_arrays
@@ -75,7 +75,7 @@ def blank_steps(name, epochs):
     return Steps(time, dt, np.ones((epochs, 2), bool), knots, fast, slow)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit, static_argnums=0)
 def monte_carlo(model, params, steps, keys):
     """Attitude NEES (runs, K) at the ends of epochs and tracker NIS (runs, K) of simulated runs."""
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import get_model, simulate
+from jaxekf import get_model, jit, simulate
 from jaxekf.models import REGISTRY
 from jaxekf.parameters import as_arrays
 from tuning import noise, objectives
@@ -51,7 +51,7 @@ def values(model, where, free, base, data):
     return jnp.stack([found[name] for name in TERMS])
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jit, static_argnums=(0, 1))
 def gradient(model, where, free, base, data, weights):
     _, pull = jax.vjp(lambda f: values(model, where, f, base, data), free)
     return pull(weights)[0]

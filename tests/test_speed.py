@@ -10,9 +10,11 @@ import scenario
 
 import tuning
 from jaxekf import (
+    blocks,
     ekf,
     estimate_many,
     estimation,
+    jit,
     padding,
     patterned,
     programs,
@@ -49,8 +51,10 @@ def test_structure_is_found_where_it_is():
 
 def test_what_is_not_understood_is_not_called_known():
     """An operation without a rule that is taken for constant."""
-    opaque = structure.find(programs.trace(lambda x: jnp.sort(x * 0.0), jnp.ones(3)))
+    opaque = structure.find(programs.trace(lambda x: jnp.sort(x) * 1.0, jnp.ones(3)))
     assert not opaque.known.any()
+    mixed = structure.find(programs.trace(lambda x: jnp.sort(x.at[1:].set(0.0)), jnp.ones(3)))
+    assert not mixed.known.any()
 
 
 @pytest.mark.parametrize("name", ["sort", "cumsum", "while", "cond", "solve"])
@@ -176,6 +180,17 @@ def test_forward_mode_names_the_way_out():
         run_filter(model, params, belief, steps, keep="nothing")
 
 
+def test_data_may_be_constants():
+    """A compiler that aborts where runs are written into the program instead of handed to it."""
+    model = get_model("loose")
+    data = tuning.prepare(model, [moving("a", 1, 20.0), moving("b", 2, 20.0)])
+    params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
+    objective = tuning.innovation_likelihood()
+    inside = jit(lambda params: tuning.evaluate(model, objective, params, data))(params)
+    handed = jit(lambda params, data: tuning.evaluate(model, objective, params, data))(params, data)
+    np.testing.assert_allclose(inside, handed, rtol=1e-12)
+
+
 def test_segments_change_nothing(monkeypatch):
     """A belief kept at the wrong epoch, or the padding of the last segment that is not inert."""
     model = get_model("loose")
@@ -184,7 +199,7 @@ def test_segments_change_nothing(monkeypatch):
 
     def slopes():
         recursion._with_adjoint.cache_clear()
-        return jax.jit(
+        return jit(
             jax.grad(lambda p: jnp.sum(run_filter(model, p, belief, steps).instants.log_likelihood))
         )(params)
 
@@ -209,7 +224,7 @@ def test_what_is_not_kept_changes_nothing():
 
 def test_blocks_of_runs(monkeypatch):
     """A run that changes when it stands in another block, beside others, or beside filling."""
-    monkeypatch.setattr(recursion, "LANES", 2)
+    monkeypatch.setattr(blocks, "LANES", 2)
     recursion._with_adjoint.cache_clear()
     model, params, belief, steps = small()
     factors = jnp.linspace(0.5, 1.5, 5)
@@ -220,7 +235,7 @@ def test_blocks_of_runs(monkeypatch):
         output = ekf.run_filter_batch(model, params, *spread)
         return jnp.sum(output.instants.log_likelihood), output.instants.updated.cov
 
-    (_, covs), slopes = jax.jit(jax.value_and_grad(value, has_aux=True))(every)
+    (_, covs), slopes = jit(jax.value_and_grad(value, has_aux=True))(every)
     recursion._with_adjoint.cache_clear()
     monkeypatch.undo()
     for i in range(5):

@@ -9,12 +9,13 @@ from jax import Array
 
 from jaxekf.errors import TuningError
 from jaxekf.estimation import evaluate_outputs
+from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
 from tuning.objectives import output_error, run_batch
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit, static_argnums=0)
 def _nees(model: Model, params: Parameters, data: Data) -> tuple[Array, Array]:
     """Sum of normalised squared attitude errors over all judged instants, and of degrees of freedom."""
     output = run_batch(model, params, data, "estimates")

@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jax import Array
 from jaxekf import parameters
 from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, provenance, require_float64
+from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
@@ -73,24 +74,7 @@ class Tuned:
         parameters.save(folder, self.model, self.params, self.origin)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _value_and_gradient(
-    model: Model,
-    objective: Objective,
-    where: Layout,
-    free: Array,
-    base: Parameters,
-    data: Data,
-    counts: dict[str, Array],
-) -> tuple[Array, Array]:
-    def value(free: Array) -> Array:
-        return evaluate(model, objective, where.from_free(free, base), data, counts)
-
-    return jax.value_and_grad(value)(free)
-
-
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _value(
+def _objective_value(
     model: Model,
     objective: Objective,
     where: Layout,
@@ -100,6 +84,10 @@ def _value(
     counts: dict[str, Array],
 ) -> Array:
     return evaluate(model, objective, where.from_free(free, base), data, counts)
+
+
+_value = jit(_objective_value, static_argnums=(0, 1, 2))
+_value_and_gradient = jit(jax.value_and_grad(_objective_value, 3), static_argnums=(0, 1, 2))
 
 
 def tune(
@@ -208,6 +196,11 @@ class _Search:
         """What the terms are the means over."""
         return total_counts(self.training, self.objective)
 
+    @cached_property
+    def validation_counts(self) -> dict[str, Array]:
+        """The same of the validation runs."""
+        return total_counts(self.validation or (), self.objective)
+
     def value_and_gradient(self, free: Array) -> tuple[float, Array]:
         counts = self.training_counts
         found = [
@@ -223,7 +216,7 @@ class _Search:
     def validation_value(self, free: Array) -> float:
         if self.validation is None:
             return float("nan")
-        counts = total_counts(self.validation, self.objective)
+        counts = self.validation_counts
         return float(
             sum(
                 _value(self.model, self.objective, self.layout, free, self.base, data, counts)

@@ -1,0 +1,123 @@
+"""Many runs of random lengths through `estimate` and `tune`: ``python benchmarks/lengths.py [--quick]``.
+
+Counts the programs compiled against the buckets of lengths, times a first and a second pass, and compares
+every estimate with the same run filtered alone and unpadded. Prints a table and, last, one line of JSON.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from typing import Any
+
+import jax
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from rich.progress import Progress  # noqa: E402
+
+import jaxekf  # noqa: E402
+import tuning  # noqa: E402
+from jaxekf import estimation, padding, simulate  # noqa: E402
+from tuning import fit  # noqa: E402
+
+_RATE = simulate.SensorGrade().optical_hz
+"""Steps a second: the gyroscope is an input, each tracker sample a step."""
+
+
+def recordings(count: int, shortest: int, longest: int) -> list[Any]:
+    """Simulated runs whose numbers of steps are drawn evenly."""
+    lengths = np.random.default_rng(6).uniform(shortest, longest, count)
+    return [
+        simulate.recording(
+            f"run{i}",
+            simulate.free_motion(i, speed_deg=60.0, rest_s=0.1),
+            seed=i,
+            duration_s=length / _RATE,
+        )
+        for i, length in enumerate(lengths)
+    ]
+
+
+def difference(model: Any, lines: list[Any], found: list[Any]) -> float:
+    """The largest relative difference to runs filtered alone, unpadded."""
+    params = jax.tree.map(jnp.asarray, model.parameters)
+    worst = 0.0
+    for line, estimate in zip(lines, found, strict=True):
+        belief = jaxekf.initial_belief(model, params, line.first)
+        steps = jax.tree.map(jnp.asarray, line.steps)
+        alone = jaxekf.run_filter(model, params, belief, steps, keep="estimates").instants.updated
+        for a, b in (
+            *zip(jax.tree.leaves(estimate.state), jax.tree.leaves(alone.mean), strict=True),
+            (estimate.cov, alone.cov),
+        ):
+            b = np.asarray(b)[line.valid]
+            worst = max(worst, float(np.max(np.abs(a - b)) / np.max(np.abs(b))))
+    return worst
+
+
+def timed(function: Any) -> tuple[Any, float]:
+    """What it returns, and the seconds it took."""
+    begin = time.perf_counter()
+    found = function()
+    return found, time.perf_counter() - begin
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
+    quick = parser.parse_args().quick
+    count, shortest, longest, compared = (12, 100, 1_000, 3) if quick else (100, 500, 20_000, 10)
+    model = jaxekf.get_model("loose")
+    with Progress(disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task("simulating", total=5)
+
+        def done(what: str) -> None:
+            progress.update(task, advance=1, description=what)
+
+        runs = recordings(count, shortest, longest)
+        lines = jaxekf.timeline.build_many(model, runs)
+        buckets = len(padding.groups(lines))
+        done("estimating")
+        found, first = timed(lambda: jaxekf.estimate_many(runs, model))
+        compiled = estimation._run._cache_size()
+        done("estimating again")
+        found, second = timed(lambda: jaxekf.estimate_many(runs, model))
+        again = estimation._run._cache_size() - compiled
+        done("comparing")
+        some = [int(i) for i in np.linspace(0, count - 1, compared)]
+        worst = difference(model, [lines[i] for i in some], [found[i] for i in some])
+        done("tuning")
+        tuned, spent = timed(
+            lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=3)
+        )
+        programs = fit._value_and_gradient._cache_size()
+        timed(lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=1))
+        more = fit._value_and_gradient._cache_size() - programs
+        done("done")
+    result = {
+        "runs": count,
+        "steps": sum(int(line.valid.sum()) for line in lines),
+        "buckets": buckets,
+        "estimate: programs": compiled,
+        "estimate: programs of a second pass": again,
+        "estimate: s": round(first, 2),
+        "estimate: s of a second pass": round(second, 2),
+        f"estimate: largest relative difference to unpadded, {compared} runs": worst,
+        "tune: programs": programs,
+        "tune: programs of a second pass": more,
+        "tune: s, 3 iterations": round(spent, 2),
+        "tune: objective": [float(step.training) for step in tuned.history],
+    }
+    for name, value in result.items():
+        print(f"{name}: {value}")
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -138,7 +138,7 @@ def measure(point: Point) -> Point:
     import jax.numpy as jnp
     import problem
 
-    from jaxekf import run_filter_batch
+    from jaxekf import jit, run_filter_batch
 
     if point.states == 10:
         model, given = problem.MODEL, problem.steps(problem.measurements(point.runs, point.steps))
@@ -160,7 +160,7 @@ def measure(point: Point) -> Point:
         return jnp.sum(output.instants.log_likelihood), output.instants.updated.mean
 
     forward = point.kind == "forward"
-    function = jax.jit(total if forward else jax.value_and_grad(total, has_aux=True))
+    function = jit(total if forward else jax.value_and_grad(total, has_aux=True))
     base = _resident()
     begin = time.perf_counter()
     jax.block_until_ready(function(noise, given))

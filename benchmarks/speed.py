@@ -29,11 +29,18 @@ from problem import NOISE, STEPS, Noise, measurements  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
+import jaxekf  # noqa: E402
+
+OURS = "jaxekf"
+"""Compiled by `jaxekf.jit`, as `estimate` and `tune` are."""
+PLAIN = "jaxekf, plain jax.jit"
+
 
 def contenders() -> dict[str, tuple[object, object]]:
     """By name: the filter of many runs, and what turns measurements into its input."""
     found = {
-        "jaxekf": (peers.ours, peers.given_to_ours),
+        OURS: (peers.ours, peers.given_to_ours),
+        PLAIN: (peers.ours, peers.given_to_ours),
         "textbook JAX": (peers.over_runs(peers.textbook), jax.numpy.asarray),
     }
     for name in ("dynamax", "cuthbert"):
@@ -51,7 +58,7 @@ def agree(filters: dict[str, tuple[object, object]]) -> None:
     if peers.available("filterpy"):
         found = [peers.filterpy(NOISE, one) for one in z]
         results["filterpy"] = np.stack([m for m, _ in found]), sum(t for _, t in found)
-    mean, total = results["jaxekf"]
+    mean, total = results[OURS]
     for name, (other, likelihood) in results.items():
         # dynamax adds 1e-9 to the diagonal of S before it solves, and so differs by that much.
         loose = name == "dynamax"
@@ -63,7 +70,7 @@ def agree(filters: dict[str, tuple[object, object]]) -> None:
     }
     for name, slope in slopes.items():
         tolerance = 2e-2 if name == "dynamax" else 1e-5
-        np.testing.assert_allclose(slope, slopes["jaxekf"], rtol=tolerance, err_msg=name)
+        np.testing.assert_allclose(slope, slopes[OURS], rtol=tolerance, err_msg=name)
 
 
 def timed(function: object, *args: object, seconds: float) -> tuple[float, float]:
@@ -106,14 +113,13 @@ def main() -> None:
         z = measurements(runs)
         for name, (run, give) in filters.items():
             given = give(z)
+            compiled = jaxekf.jit if name == OURS else jax.jit
             if not (runs == 1024 and name == "cuthbert"):
-                measure(speed, first, name, f"{runs} forward", jax.jit(run), given, runs, seconds)
-            if runs == 64:
-                gradient = jax.jit(jax.value_and_grad(lambda n, g, run=run: run(n, g)[1]))
-                measure(speed, first, name, "64 gradient", gradient, given, runs, seconds)
-            if runs == 1:
-                gradient = jax.jit(jax.value_and_grad(lambda n, g, run=run: run(n, g)[1]))
-                measure(speed, first, name, "1 gradient", gradient, given, runs, seconds)
+                forward = compiled(run)
+                measure(speed, first, name, f"{runs} forward", forward, given, runs, seconds)
+            if runs < 1024:
+                gradient = compiled(jax.value_and_grad(lambda n, g, run=run: run(n, g)[1]))
+                measure(speed, first, name, f"{runs} gradient", gradient, given, runs, seconds)
     if peers.available("filterpy"):
         z = measurements(1, 300)[0]
         begin = time.perf_counter()
@@ -154,8 +160,12 @@ def measure(
 
 def ratios(speed: dict[str, dict[str, float]]) -> dict[str, float]:
     """What the project asks of itself, from the same run of the script."""
-    own = speed["jaxekf"]
-    found = {"gradient / forward, 64 runs": own["64 gradient"] / own["64 forward"]}
+    own = speed[OURS]
+    found = {
+        f"gradient / forward, 64 runs, {name}": speed[name]["64 gradient"]
+        / speed[name]["64 forward"]
+        for name in (OURS, PLAIN)
+    }
     scalar = speed.get("C++ scalar, one thread", {}).get("1 forward")
     vector = [v["1024 forward"] for k, v in speed.items() if k.startswith("C++ vectors")]
     for column, value in own.items():
@@ -176,7 +186,7 @@ def show(
 ) -> None:
     """The tables."""
     console = Console(width=110)
-    columns = list(speed["jaxekf"])
+    columns = list(speed[OURS])
     table = Table(title="microseconds per step and run (first call, s)")
     table.add_column("filter")
     for column in columns:

@@ -50,8 +50,9 @@ def outer(left: Array, right: Array) -> Array:
 
 def on_diagonal(values: Array) -> Array:
     """Diagonal matrices, (n, lanes) to (n, n, lanes)."""
-    eye = np.eye(values.shape[0], dtype=bool)[:, :, None]
-    return jnp.where(eye, values[None], jnp.zeros((), values.dtype))
+    # Row by row: the derivative of a broadcast would be a reduction, which `kernels.block` cannot hold.
+    here = np.eye(values.shape[0], dtype=bool)[:, :, None]
+    return jnp.stack([jnp.where(row, values, 0.0) for row in here])
 
 
 # --- M P M' -------------------------------------------------------------------------------------------

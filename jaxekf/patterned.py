@@ -93,10 +93,30 @@ def transpose(block: Array | None) -> Array | None:
 
 def dense(p: Pattern, block: Array | None, lanes: int, dtype: Any) -> Array:
     """The whole matrix, (rows, cols, lanes)."""
-    eye = jnp.broadcast_to(
-        jnp.eye(p.shape[1], dtype=dtype)[:, :, None], (p.shape[1],) * 2 + (lanes,)
-    )
-    return multiply(p, block, eye)
+    base = np.broadcast_to(p.base[:, :, None], (*p.shape, lanes))
+    if block is None or not p.rows:
+        return jnp.asarray(base, dtype)
+    wide = _placed(block, p.cols, p.shape[1], 1)
+    return _placed(wide, p.rows, p.shape[0], 0) + jnp.asarray(base, dtype)
+
+
+def _placed(array: Array, index: Sequence[int], size: int, axis: int) -> Array:
+    """`array` spread along `axis` to the places of `index` among zeros, `size` in all."""
+    pieces, filled, taken = [], 0, 0
+
+    def zeros(count: int) -> Array:
+        shape = list(array.shape)
+        shape[axis] = count
+        return jnp.zeros(shape, array.dtype)
+
+    for run in _runs(list(index)):
+        if run[0] > filled:
+            pieces.append(zeros(run[0] - filled))
+        pieces.append(lax.slice_in_dim(array, taken, taken + len(run), axis=axis))
+        filled, taken = run[-1] + 1, taken + len(run)
+    if size > filled:
+        pieces.append(zeros(size - filled))
+    return lax.concatenate(pieces, axis)
 
 
 def multiply(p: Pattern, block: Array | None, x: Array, axis: int = 0) -> Array:

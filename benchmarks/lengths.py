@@ -92,6 +92,17 @@ def main() -> None:
         done("comparing")
         some = [int(i) for i in np.linspace(0, count - 1, compared)]
         worst = difference(model, [lines[i] for i in some], [found[i] for i in some])
+        result = {
+            "runs": count,
+            "steps": sum(int(line.valid.sum()) for line in lines),
+            "buckets": buckets,
+            "estimate: programs": compiled,
+            "estimate: programs of a second pass": again,
+            "estimate: s": round(first, 2),
+            "estimate: s of a second pass": round(second, 2),
+            f"estimate: largest relative difference to unpadded, {compared} runs": worst,
+        }
+        report(result)
         done("tuning")
         tuned, spent = timed(
             lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=3)
@@ -100,23 +111,20 @@ def main() -> None:
         timed(lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=1))
         more = fit._value_and_gradient._cache_size() - programs
         done("done")
-    result = {
-        "runs": count,
-        "steps": sum(int(line.valid.sum()) for line in lines),
-        "buckets": buckets,
-        "estimate: programs": compiled,
-        "estimate: programs of a second pass": again,
-        "estimate: s": round(first, 2),
-        "estimate: s of a second pass": round(second, 2),
-        f"estimate: largest relative difference to unpadded, {compared} runs": worst,
+    of_tuning = {
         "tune: programs": programs,
         "tune: programs of a second pass": more,
         "tune: s, 3 iterations": round(spent, 2),
         "tune: objective": [float(step.training) for step in tuned.history],
     }
-    for name, value in result.items():
-        print(f"{name}: {value}")
-    print(json.dumps(result))
+    report(of_tuning)
+    print(json.dumps(result | of_tuning))
+
+
+def report(found: dict[str, Any]) -> None:
+    """Print what is known so far."""
+    for name, value in found.items():
+        print(f"{name}: {value}", flush=True)
 
 
 if __name__ == "__main__":

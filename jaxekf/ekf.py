@@ -124,12 +124,19 @@ def run_filter_batch(
     Equal to `vmap` of `run_filter`, and to calls of it one by one; options as there. With several
     `devices` the runs are shared among them; CPU cores are devices where JAX's `jax_num_cpu_devices`
     was set before its first use.
+
+    Raises `ModelError` as `run_filter` does, and where there is no run or no step.
     """
     if keep not in _KEPT:
         raise ModelError(
             f"got keep='{keep}', expected one of {sorted(_KEPT)}; choose what is to be kept"
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
+    if 0 in steps.dt.shape:
+        raise ModelError(
+            f"got steps of shape {steps.dt.shape} (runs, epochs, substeps), expected at least one of"
+            " each; leave out runs without data"
+        )
     inputs = jax.vmap(partial(inputs_of, model))(params, steps)
     sizes: Any = _one_sample((params, belief.mean), 1)
     u, fast = _one_sample((inputs, steps.fast), 3)

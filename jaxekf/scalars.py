@@ -38,7 +38,7 @@ def numbers_of(program: Program) -> tuple[list[Numbers], bool]:
 
 
 def used(outputs: list[Numbers], count: int) -> list[list[tuple[int, ...]]]:
-    """Which numbers of each of the first `count` inputs the outputs depend on."""
+    """Which numbers of each of the first `count` inputs the outputs of a plain program depend on."""
     found: list[set[Any]] = [set() for _ in range(count)]
     for node in _order(outputs)[0]:
         if node.operation is None and node.inputs[0] < count:

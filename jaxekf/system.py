@@ -30,7 +30,9 @@ class Piece:
         self._head, body = programs.split(program, len(jax.tree.leaves(params)))
         count = len(self._head.outputs)
         numbers, self.is_plain = scalars.numbers_of(body)
-        self._used = scalars.used(numbers, count)
+        # Through an operation that is not taken apart anything may be used.
+        every = [sorted(np.ndindex(*spec.shape)) for spec in body.inputs[:count]]
+        self._used = scalars.used(numbers, count) if self.is_plain else every
         self._body = _compact(body, count, self._used)
         self._on_lanes = partial(_on_lanes, self._body)
         self._pullback: Program | None = None

@@ -1,5 +1,8 @@
 """The fast filter against a naive one, for every model: values and gradients, rows hidden at random."""
 
+import dataclasses
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import naive
@@ -10,6 +13,9 @@ import toy_models
 from test_contract import MODELS, data, parameters, start
 
 from jaxekf import ekf
+from jaxekf.errors import ModelError
+from jaxekf.model import Belief
+from jaxekf.timeline import Rows, Steps
 
 
 def hidden_at_random(steps, seed):
@@ -109,3 +115,66 @@ def test_blocks_hold_arithmetic_only(name):
     names = set(inside_blocks(jax.make_jaxpr(jax.grad(total))(params).jaxpr))
     assert "scan" in names
     assert not {n for n in names if n.startswith(("reduce_", "dot_general", "custom_call", "argm"))}
+
+
+class Tuned(NamedTuple):
+    """One number that the transition or the sensor takes from the parameters."""
+
+    c: Any
+
+
+WHOLE = {
+    "scatter": lambda x, c: x.at[1].set(x[2] * c),
+    "cond": lambda x, c: jax.lax.cond(x[0] > 0.0, lambda: x * c, lambda: x - c),
+    "loop": lambda x, c: jax.lax.fori_loop(0, 3, lambda i, y: y + 0.1 * jnp.sin(y) * c, x),
+    "solve": lambda x, c: jnp.linalg.solve(2.0 * jnp.eye(3) + c * jnp.outer(x, x), x),
+}
+
+
+@pytest.mark.parametrize("where", ["transition", "sensor"])
+@pytest.mark.parametrize("name", WHOLE)
+def test_parameters_inside_whole_operations(name, where):
+    """A parameter taken for unused, with zero in its place, where an operation is not taken apart."""
+    move = WHOLE[name]
+    plain = {"transition": lambda x, c: x, "sensor": lambda x, c: x} | {where: move}
+    linear = toy_models.linear_model(np.eye(3), 0.1 * np.eye(3), [np.eye(3)], [0.2 * np.eye(3)])
+    sensor = dataclasses.replace(
+        linear.sensors[0],
+        predict=lambda x, u, params, aux: plain["sensor"](x, params.calibration.c),
+    )
+    model = dataclasses.replace(
+        linear,
+        transition=lambda x, u, dt, w, params: plain["transition"](x, params.calibration.c) + w,
+        sensors=(sensor,),
+    )
+    params = model.parameters._replace(calibration=Tuned(jnp.asarray(0.7)))
+    belief = Belief(jnp.array([0.4, 0.5, 0.6]), jnp.eye(3))
+    value = np.random.default_rng(2).uniform(0.2, 1.0, (5, 1, 3))
+    one = np.ones((5, 1))
+    rows = Rows(value, None, np.ones((5, 1, 3), bool), one)
+    steps = Steps(np.cumsum(one)[:, None], one, one > 0, None, {"sensor_0": rows}, {})
+    steps = jax.tree.map(jnp.asarray, steps)
+
+    def fast(params):
+        found = outputs_of(ekf.run_filter(model, params, belief, steps))
+        return weighted(found, 3), found
+
+    def slow(params):
+        found = naive.run(model, params, belief, steps)
+        return weighted(found, 3), found
+
+    (_, found), slope = jax.value_and_grad(fast, has_aux=True)(params)
+    (_, wanted), expected = jax.value_and_grad(slow, has_aux=True)(params)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(slope.calibration.c, expected.calibration.c, rtol=1e-9)
+
+
+def test_no_steps_are_refused():
+    """A division by zero instead of a sentence."""
+    model, params = MODELS["triad"], parameters(MODELS["triad"])
+    given = data(model, 1)
+    none = jax.tree.map(lambda a: a[:0], given.epochs._replace(knots=None))
+    none = none._replace(knots=given.epochs.knots)
+    with pytest.raises(ModelError, match="at least one"):
+        ekf.run_filter(model, params, start(model, params, given.mean), none)

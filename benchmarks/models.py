@@ -1,17 +1,16 @@
 """Other models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`."""
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from clock import timed
 from jax import Array, lax
 
 from jaxekf import jit, manifold, run_filter_batch
@@ -155,12 +154,5 @@ def _both(
     """Microseconds per step and run of both."""
     times = {}
     for name, function in (("jaxekf", jit(own)), ("textbook JAX", jax.jit(plain))):
-        jax.block_until_ready(function(*args))
-        taken = []
-        until = time.perf_counter() + seconds
-        while len(taken) < 3 or time.perf_counter() < until:
-            begin = time.perf_counter()
-            jax.block_until_ready(function(*args))
-            taken.append(time.perf_counter() - begin)
-        times[name] = median(taken) / (_RUNS * _STEPS) * 1e6
+        times[name] = timed(function, *args, seconds=seconds)[1] / (_RUNS * _STEPS) * 1e6
     return times

@@ -10,10 +10,8 @@ import json
 import resource
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -137,6 +135,7 @@ def measure(point: Point) -> Point:
     jax.config.update("jax_enable_x64", True)
     import jax.numpy as jnp
     import problem
+    from clock import timed
 
     from jaxekf import jit, run_filter_batch
 
@@ -162,20 +161,12 @@ def measure(point: Point) -> Point:
     forward = point.kind == "forward"
     function = jit(total if forward else jax.value_and_grad(total, has_aux=True))
     base = _resident()
-    begin = time.perf_counter()
-    jax.block_until_ready(function(noise, given))
-    first = time.perf_counter() - begin
-    times: list[float] = []
-    until = time.perf_counter() + _SECONDS
-    while len(times) < 3 or time.perf_counter() < until:
-        begin = time.perf_counter()
-        jax.block_until_ready(function(noise, given))
-        times.append(time.perf_counter() - begin)
+    first, each = timed(function, noise, given, seconds=_SECONDS)
     return Point(
         **{
             **vars(point),
-            "seconds": median(times),
-            "first_s": first - median(times),
+            "seconds": each,
+            "first_s": first - each,
             "peak_mib": _resident(),
             "base_mib": base,
         }

@@ -9,7 +9,6 @@ import json
 import os
 import platform
 import resource
-import statistics
 import sys
 import time
 from importlib.metadata import version
@@ -25,6 +24,7 @@ import numpy as np  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parent))
 import models  # noqa: E402
 import peers  # noqa: E402
+from clock import timed  # noqa: E402
 from problem import NOISE, STEPS, Noise, measurements  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
@@ -71,20 +71,6 @@ def agree(filters: dict[str, tuple[object, object]]) -> None:
     for name, slope in slopes.items():
         tolerance = 2e-2 if name == "dynamax" else 1e-5
         np.testing.assert_allclose(slope, slopes[OURS], rtol=tolerance, err_msg=name)
-
-
-def timed(function: object, *args: object, seconds: float) -> tuple[float, float]:
-    """Seconds of the first call, and the median of later ones."""
-    begin = time.perf_counter()
-    jax.block_until_ready(function(*args))
-    first = time.perf_counter() - begin
-    times = []
-    until = time.perf_counter() + seconds
-    while len(times) < 3 or (time.perf_counter() < until and len(times) < 30):
-        begin = time.perf_counter()
-        jax.block_until_ready(function(*args))
-        times.append(time.perf_counter() - begin)
-    return first, statistics.median(times)
 
 
 def main() -> None:

@@ -79,10 +79,8 @@ ELEMENTWISE = CHEAP | frozenset(
 """Operations on each number alone."""
 
 
-def spread(value: Any, on_lanes: bool, lanes: int) -> Array:
-    """A value with the lanes axis, added where it was missing."""
-    if on_lanes:
-        return value
+def spread(value: Any, lanes: int) -> Array:
+    """A value that is the same on all lanes, with the lanes axis."""
     value = jnp.asarray(value)
     return lax.broadcast_in_dim(value, (*value.shape, lanes), tuple(range(value.ndim)))
 

@@ -59,7 +59,7 @@ def _graph(program: Program, values: Sequence[Array]) -> tuple[list[Numbers], li
         if not isinstance(operand, Constant):
             return known[operand]
         if isinstance(operand.value, core.Tracer):
-            sources.append(lanes.spread(operand.value, False, width))
+            sources.append(lanes.spread(operand.value, width))
             return leaves(len(sources) - 1, operand.value.shape, operand.value.dtype)
         return constants(operand.value)
 

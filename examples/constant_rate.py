@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 import jaxekf
-from jaxekf import metrics, plots, recording, simulate
+from jaxekf import metrics, plots, simulate
 
 REST_S, TURN_S = 60.0, 20.0
 OCCLUSION_S = (REST_S + 10.0, REST_S + 10.5)
@@ -62,16 +62,16 @@ def measurement_rmse(record: jaxekf.Recording) -> tuple[float, float]:
     """Attitude (deg) and rate (deg/s) RMSE of the raw tracker and gyroscope."""
     encoder, optical, imu = record.need_encoder(), record.need_optical(), record.need_imu()
     seen = optical.valid
-    truth = recording.encoder_at(encoder, optical.time_ns[seen])
+    truth = encoder_at(encoder, optical.time_ns[seen])
     attitude = metrics.attitude_error(optical.q_ref_body[seen], truth.q_ref_body)
-    rate = imu.gyroscope - recording.encoder_rate_at(encoder, imu.time_ns)
+    rate = imu.gyroscope - encoder_rate_at(encoder, imu.time_ns)
     return float(np.rad2deg(metrics.rms(attitude))), float(np.rad2deg(metrics.rms(rate)))
 
 
 def occlusion_rmse(estimate: jaxekf.Estimate, record: jaxekf.Recording) -> float:
     """Attitude RMSE in degrees while the tracker is hidden."""
     inside = (estimate.time >= OCCLUSION_S[0]) & (estimate.time < OCCLUSION_S[1])
-    truth = recording.encoder_at(record.need_encoder(), estimate.time_ns[inside])
+    truth = encoder_at(record.need_encoder(), estimate.time_ns[inside])
     error = metrics.attitude_error(estimate.attitude.value[inside], truth.q_ref_body)
     return float(np.rad2deg(metrics.rms(error)))
 

@@ -9,11 +9,10 @@ from jaxekf.recording import (
     Optical,
     Recording,
     Times,
-    encoder_at,
-    encoder_rate_at,
     to_scipy,
 )
 from jaxekf.result import Estimate
+from jaxekf.truth import encoder_at, encoder_rate_at
 
 
 class Score(NamedTuple):

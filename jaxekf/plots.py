@@ -17,13 +17,12 @@ from jaxekf.recording import (
     Floats,
     Recording,
     Times,
-    encoder_at,
-    encoder_rate_at,
     period_ns,
     to_scipy,
 )
 from jaxekf.result import Estimate
 from jaxekf.timeline import fill_gaps
+from jaxekf.truth import encoder_at, encoder_rate_at
 
 ESTIMATE, MEASURED, TRUTH, HELD = "#0b5394", "#e69138", "#222222", "#a61c00"
 _AXES = ("x", "y", "z")

@@ -7,11 +7,11 @@ not to be believed (a hidden tracker, a zero quaternion) is invalid, not removed
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from jaxekf.errors import RecordingError
 
@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NANOSECONDS = 1_000_000_000
+
+STREAMS = ("optical", "markers", "imu", "encoder")
+"""What a recording may hold."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class Samples:
     """True where a row is visible: (N,) for whole samples, (N, rows) for single rows."""
     aux: Any = None
     """Per-sample data for `predict` and `noise`: a pytree of arrays (N, ...)."""
+    latency_ns: int = 0
+    """How long after `time_ns` a sample was known."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +48,69 @@ class Optical:
     """Attitude, and often position, of the tool in the tracker's reference frame."""
 
     time_ns: Times
+    """Stamps; a sample was taken `latency_ns` before."""
     q_ref_body: Floats
     """Unit quaternions (N, 4), w x y z, body to reference."""
     valid: Flags
     position: Floats | None = None
-    """Position (N, 3) in metres in the reference frame."""
+    """Position (N, 3) in metres in the reference frame, of the point `p_body_tool`."""
+    error: Floats | None = None
+    """Reported fit error (N,) in metres; NaN where none was reported."""
+    p_body_tool: Floats | None = None
+    """(3,) metres: where in the body the point is whose position is given; None for its origin."""
+    latency_ns: int = 0
+
+    per_sample: ClassVar = ("q_ref_body", "valid", "position", "error")
+
+
+@dataclass(frozen=True)
+class Markers:
+    """Single optical markers of one rigid tool, each in the tracker's reference frame."""
+
+    time_ns: Times
+    """Stamps of the tracker's frames; a frame was taken `latency_ns` before."""
+    position: Floats
+    """(N, M, 3) metres in the reference frame; of a hidden marker anything."""
+    visible: Flags
+    """(N, M)."""
+    names: tuple[str, ...]
+    p_body_marker: Floats
+    """(M, 3) metres: the geometry, in the body frame (the IMU's)."""
+    quality: Floats | None = None
+    """(N, M) as reported, larger is better; NaN where none was reported."""
+    quality_min: float = 0.0
+    """Markers of less quality are not used."""
+    error: Floats | None = None
+    """(N, M) reported fit error in metres; NaN where none was reported."""
+    latency_ns: int = 0
+
+    per_sample: ClassVar = ("position", "visible", "quality", "error")
+
+    @property
+    def usable(self) -> Flags:
+        """(N, M): visible, finite and of sufficient quality."""
+        usable = self.visible & np.isfinite(self.position).all(axis=2)
+        if self.quality is not None:
+            with np.errstate(invalid="ignore"):
+                usable &= ~(self.quality < self.quality_min)
+        return usable
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        shapes = {
+            "position": (len(self.time_ns), count, 3),
+            "visible": (len(self.time_ns), count),
+            "p_body_marker": (count, 3),
+        }
+        for key, shape in shapes.items():
+            got = np.shape(getattr(self, key))
+            if got != shape:
+                raise RecordingError(
+                    "markers",
+                    f"{key} of shape {got}",
+                    f"{shape} for {len(self.time_ns)} frames of {count} markers",
+                    "giving every marker its place in the body and in every frame",
+                )
 
 
 @dataclass(frozen=True)
@@ -62,10 +125,12 @@ class Imu:
     magnetometer: Floats | None = None
     """Field (N, 3) in the sensor's unit."""
 
+    per_sample: ClassVar = ("gyroscope", "accelerometer", "magnetometer")
+
 
 @dataclass(frozen=True)
 class Encoder:
-    """Attitude truth from the robot's joints, in the tracker's reference frame."""
+    """Truth from the robot's joints, in the tracker's reference frame: attitude, maybe position."""
 
     time_ns: Times
     q_ref_body: Floats
@@ -73,6 +138,10 @@ class Encoder:
     valid: Flags
     scored: Flags
     """Samples on which an estimate is judged."""
+    position: Floats | None = None
+    """(N, 3) metres: position of the body's origin in the reference frame."""
+
+    per_sample: ClassVar = ("q_ref_body", "valid", "scored", "position")
 
 
 @dataclass(frozen=True)
@@ -84,8 +153,10 @@ class Recording:
     imu: Imu | None = None
     encoder: Encoder | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Free-form facts: marker geometry, pivot, licence, seed."""
+    """Facts: ``gravity_ref`` (free fall, m/s^2, reference frame), ``p_body_object`` and
+    ``q_body_object`` (the point and frame of the tool that is asked for), licence, seed."""
     path: Path | None = None
+    markers: Markers | None = None
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):
@@ -95,7 +166,7 @@ class Recording:
                 "a name that can be a folder's",
                 "changing it in recording.toml",
             )
-        for label in ("optical", "imu", "encoder"):
+        for label in STREAMS:
             stream = getattr(self, label)
             if stream is not None:
                 _check_stream(self.path or self.name, label, stream)
@@ -107,6 +178,10 @@ class Recording:
     def need_optical(self) -> Optical:
         """The optical stream, or an error that names the run."""
         return self._need("optical")
+
+    def need_markers(self) -> Markers:
+        """The markers, or an error that names the run."""
+        return self._need("markers")
 
     def need_imu(self) -> Imu:
         """The IMU stream, or an error that names the run."""
@@ -138,7 +213,8 @@ def _check_stream(place: Path | str, label: str, stream: Any) -> None:
             "int64 nanoseconds",
             "casting them exactly",
         )
-    for key, value in vars(stream).items():
+    for key in stream.per_sample:
+        value = getattr(stream, key)
         if value is not None and len(value) != len(times):
             raise RecordingError(
                 place,
@@ -184,60 +260,6 @@ def to_scipy(q: Floats) -> Rotation:
 def from_scipy(rotation: Rotation) -> Floats:
     """Quaternions w, x, y, z of SciPy's rotation."""
     return np.roll(rotation.as_quat(), 1, axis=-1)
-
-
-def encoder_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Encoder:
-    """The encoder's attitude at other times, along the shorter arc between its valid samples.
-
-    Outside the recorded span, and inside gaps longer than `longest_gap_s`, the result is not valid:
-    interpolation never invents truth.
-    """
-    kept = np.flatnonzero(encoder.valid)
-    if kept.size < 2:
-        unknown = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_ns), 1))
-        no = np.zeros(len(time_ns), bool)
-        return Encoder(time_ns, unknown, no, no)
-    times = encoder.time_ns[kept]
-    after = _bracket(times, time_ns)
-    gap = (times[after] - times[after - 1]) / NANOSECONDS
-    exact = (times[after] == time_ns) | (times[after - 1] == time_ns)
-    inside = (time_ns >= times[0]) & (time_ns <= times[-1])
-    valid = inside & (exact | (gap <= longest_gap_s))
-    seconds = (times - times[0]) / NANOSECONDS
-    asked = np.clip((time_ns - times[0]) / NANOSECONDS, 0.0, seconds[-1])
-    q = from_scipy(Slerp(seconds, to_scipy(encoder.q_ref_body[kept]))(asked))
-    upper = _bracket(encoder.time_ns, time_ns)
-    nearest = upper - (time_ns - encoder.time_ns[upper - 1] < encoder.time_ns[upper] - time_ns)
-    return Encoder(time_ns, q, valid, valid & (encoder.scored & encoder.valid)[nearest])
-
-
-def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Floats:
-    """Body rate (N, 3), rad/s, at other times; NaN where the encoder does not tell.
-
-    Central differences of the encoder's attitude, interpolated linearly, neither of them over gaps
-    longer than `longest_gap_s`.
-    """
-    if len(encoder.time_ns) < 3:
-        return np.full((len(time_ns), 3), np.nan)
-    before, after = to_scipy(encoder.q_ref_body[:-2]), to_scipy(encoder.q_ref_body[2:])
-    span = (encoder.time_ns[2:] - encoder.time_ns[:-2])[:, None] / NANOSECONDS
-    rate = (before.inv() * after).as_rotvec() / span
-    rate[~(encoder.valid[:-2] & encoder.valid[1:-1] & encoder.valid[2:])] = np.nan
-    wide = np.diff(encoder.time_ns) > longest_gap_s * NANOSECONDS
-    rate[wide[:-1] | wide[1:]] = np.nan
-    middle = encoder.time_ns[1:-1]
-    seconds = (middle - middle[0]) / NANOSECONDS
-    asked = (time_ns - middle[0]) / NANOSECONDS
-    columns = [np.interp(asked, seconds, rate[:, i], left=np.nan, right=np.nan) for i in range(3)]
-    found = np.stack(columns, axis=1)
-    upper = _bracket(encoder.time_ns, time_ns)
-    found[wide[upper - 1] & (encoder.time_ns[upper] != time_ns)] = np.nan
-    return found
-
-
-def _bracket(times: Times, asked: Times) -> NDArray[np.intp]:
-    """Index of the sample at or after each asked time, so that it and the one before bracket it."""
-    return np.clip(np.searchsorted(times, asked, side="left"), 1, len(times) - 1)
 
 
 def period_ns(time_ns: Times) -> int:

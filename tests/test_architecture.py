@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     ("errors",),
     ("rotation", "linalg", "recording", "files"),
-    ("manifold", "tables"),
+    ("manifold", "tables", "truth"),
     ("model",),
     ("timeline",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),

@@ -14,8 +14,8 @@ from jaxekf import ekf, get_model, jit, manifold, metrics, rotation, simulate
 from jaxekf.estimation import estimate_many
 from jaxekf.model import Belief
 from jaxekf.parameters import as_arrays
-from jaxekf.recording import encoder_at
 from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf.truth import encoder_at
 
 RUNS = 200
 TRACKER_S = 0.016

@@ -107,7 +107,7 @@ def test_rate_covariance_holds_for_the_rate(tmp_path):
     """Would catch a rate output without the gyroscope's own noise, or with it at the wrong bandwidth."""
     r = simulate.recording("run", simulate.free_motion(2), seed=2, duration_s=60.0)
     made = jaxekf.estimate(r)
-    from jaxekf.recording import encoder_rate_at
+    from jaxekf.truth import encoder_rate_at
 
     error = made.rate.value - encoder_rate_at(r.need_encoder(), made.time_ns)
     known = np.isfinite(error).all(axis=1) & (made.time > 5.0)

@@ -234,7 +234,7 @@ def test_output_is_whole_or_not_there(tmp_path):
 
 def test_encoder_interpolation_invents_nothing():
     """Would catch truth made up over gaps, outside the run, or scored where it was unknown."""
-    from jaxekf.recording import encoder_at
+    from jaxekf.truth import encoder_at
 
     times = np.array([0, 10, 20, 400, 410], np.int64) * 1_000_000
     q = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
@@ -292,7 +292,7 @@ def test_a_gap_in_the_input_is_not_bridged():
 
 def test_rate_truth_is_not_made_up_over_gaps():
     """Would catch a rate by differences over a hole in the encoder."""
-    from jaxekf.recording import encoder_rate_at
+    from jaxekf.truth import encoder_rate_at
 
     record = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=6.0)
     encoder = record.need_encoder()

@@ -11,8 +11,9 @@ from jaxekf import padding, storage, timeline
 from jaxekf.errors import TuningError
 from jaxekf.estimation import Run
 from jaxekf.model import Model
-from jaxekf.recording import Recording, encoder_at, encoder_rate_at
+from jaxekf.recording import Recording
 from jaxekf.timeline import Steps, Timeline
+from jaxekf.truth import encoder_at, encoder_rate_at
 
 
 class Truth(NamedTuple):

@@ -21,6 +21,7 @@ import numpy as np
 
 import jaxekf
 from jaxekf import metrics, plots, simulate
+from jaxekf.truth import encoder_at, encoder_rate_at
 
 REST_S, TURN_S = 60.0, 20.0
 OCCLUSION_S = (REST_S + 10.0, REST_S + 10.5)

@@ -19,7 +19,7 @@ from jaxekf.errors import ModelError
 from jaxekf.interpolation import InputSample, sample
 from jaxekf.linearise import linearise_sensor
 from jaxekf.model import Belief, Model, Parameters, Sensor
-from jaxekf.recursion import Given, Kept, What
+from jaxekf.recursion import First, Given, Kept, What
 from jaxekf.reverse_only import reverse_only
 from jaxekf.step import Moment
 from jaxekf.timeline import Rows, Steps
@@ -65,6 +65,11 @@ class Instant(NamedTuple):
     """Log density of the rows used, given all rows before them."""
     healthy: Array
     """False where a covariance lost finiteness or definiteness."""
+    recovered: Array | None
+    """Where gates that let nothing in were opened and the belief widened (see `Model.patience_s`); None
+    without gates, or where not kept."""
+    refused: Array | None
+    """Seconds of samples that gates have refused since they last let one in; None likewise."""
 
 
 class FilterOutput(NamedTuple):
@@ -91,6 +96,7 @@ def run_filter(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
+    refused: Array | None = None,
 ) -> FilterOutput:
     """Filter one run from an initial belief; differentiable in everything, and fast under `vmap`.
 
@@ -99,13 +105,13 @@ def run_filter(
     derivatives are taken by the closed-form adjoint, several times faster than JAX's own; it has no
     forward mode (forward over reverse is fine). With ``adjoint=False`` all derivatives are JAX's own.
     For the reverse pass a few beliefs are kept and the others computed again, unless `checkpoint` is
-    False, which keeps all.
+    False, which keeps all. `refused` is `Instant.refused` of where an earlier part of the run ended.
 
     Raises `ModelError` for an unknown `keep`, and where forward mode meets the adjoint.
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
-    options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint}
-    return jax.tree.map(lambda a: a[0], run_filter_batch(model, *one, **options))
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
+    options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "refused": one[3]}
+    return jax.tree.map(lambda a: a[0], run_filter_batch(model, *one[:3], **options))
 
 
 def run_filter_batch(
@@ -117,6 +123,7 @@ def run_filter_batch(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
+    refused: Array | None = None,
     devices: Sequence[Any] = (),
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
@@ -151,12 +158,15 @@ def run_filter_batch(
         segment = recursion.segment_length(epochs, kept_bytes * lanes)
         if not checkpoint:
             segment = 1
-        moving = reverse_only((prepared, belief, given))
+        moving = reverse_only((prepared, First(belief, refused), given))
         kept = recursion.filter_with_adjoint(ready, what, segment, tuple(devices), *moving)
     else:
-        kept = recursion.filter_plainly(ready, what, checkpoint, prepared, belief, given)
+        first = First(belief, refused)
+        kept = recursion.filter_plainly(ready, what, checkpoint, prepared, first, given)
     updated: Any = Updated(kept.mean, kept.cov) if kept.cov is None else Belief(kept.mean, kept.cov)
-    instants = Instant(kept.prior, updated, kept.log_likelihood, kept.healthy)
+    instants = Instant(
+        kept.prior, updated, kept.log_likelihood, kept.healthy, kept.recovered, kept.refused
+    )
     innovations = _innovations(model, params, inputs, steps, kept) if what.used else {}
     return FilterOutput(instants, inputs, innovations)
 

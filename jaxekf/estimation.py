@@ -16,7 +16,7 @@ from jaxekf.ekf import FilterOutput
 from jaxekf.errors import FilterError, PrecisionError
 from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
-from jaxekf.models import get_model
+from jaxekf.models import adapted, get_model
 from jaxekf.recording import NANOSECONDS, Recording
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.timeline import Steps, Timeline
@@ -49,21 +49,25 @@ def estimate_many(
 ) -> list[Estimate]:
     """Estimate several runs side by side with the same parameters; equal to one call for each."""
     require_float64()
-    chosen = get_model(model)
-    recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+    recordings = read(runs)
+    chosen = adapted(get_model(model), recordings)
     timelines = timeline.build_many(chosen, recordings)
     used = parameters.as_arrays(chosen.parameters if params is None else params)
     parameters.check(used)
-    firsts = [line.first for line in timelines]
-    results = filter_timelines(chosen, used, firsts, timelines)
+    results = filter_timelines(chosen, used, timelines)
     return [
         _collect(chosen, used, recording, line, *result)
         for recording, line, result in zip(recordings, timelines, results, strict=True)
     ]
 
 
+def read(runs: Sequence[Run]) -> list[Recording]:
+    """The recordings of runs, those given as paths read from disk."""
+    return [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+
+
 def filter_timelines(
-    model: Model, params: Parameters, firsts: Sequence[dict[str, Any]], lines: Sequence[Timeline]
+    model: Model, params: Parameters, lines: Sequence[Timeline]
 ) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
     """Filter runs side by side, and check each.
 
@@ -74,8 +78,8 @@ def filter_timelines(
     for members in padding.groups(lines):
         group = [lines[i] for i in members]
         steps = padding.bucketed(group)
-        means = [model.initial_mean(firsts[i]) for i in members]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *means)
+        starts = [(model.initial_mean(lines[i].first), lines[i].setup) for i in members]
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         size = min(len(members), _batch(model, steps))
         for start in range(0, len(members), size):
             # The last batch is filled with the last run: another size would be another program.
@@ -105,10 +109,14 @@ def sharing_devices() -> tuple[Any, ...]:
 
 @partial(jit, static_argnums=(0, 1))
 def _run(
-    model: Model, devices: tuple[Any, ...], params: Parameters, means: Any, steps: Steps
+    model: Model,
+    devices: tuple[Any, ...],
+    params: Parameters,
+    starts: tuple[Any, Any],
+    steps: Steps,
 ) -> Any:
-    runs = steps.dt.shape[0]
-    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    means, setup = starts
+    every = parameters.for_runs(params, setup, steps.dt.shape[0])
     cov = jax.vmap(model.initial_covariance)(every)
     output = ekf.run_filter_batch(model, every, Belief(means, cov), steps, devices=devices)
     return output, evaluate_outputs(model, every, output)
@@ -225,7 +233,8 @@ def _collect(
         sensors=sensors,
         log_likelihood=total,
         account=account,
-        params=params,
+        params=params._replace(setup=line.setup),
+        notes=line.notes,
         provenance=provenance() | {"recording": str(recording.path or recording.name)},
     )
 

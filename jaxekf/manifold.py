@@ -29,6 +29,8 @@ class Manifold(ABC):
 
     unit: str
     """Unit of the error vector."""
+    frame: str = "body"
+    """Frame in which the error vector is counted."""
 
     @property
     @abstractmethod
@@ -89,6 +91,7 @@ class Euclidean(Manifold):
     size: int
     unit: str = ""
     labels: tuple[str, ...] = ()
+    frame: str = "body"
 
     @property
     def dim(self) -> int:

@@ -5,7 +5,7 @@ parameters. It is written for one run, one step and one sample; the filter diffe
 it over time and maps it over runs. Nothing here knows a particular model.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,6 +22,19 @@ SensorNoise = Callable[["Parameters", Any, Array], Array]
 Source = Callable[[Recording], Samples]
 
 
+class Start(NamedTuple):
+    """Where a run starts, and what is known there."""
+
+    time_ns: int
+    first: dict[str, Any]
+    """What `Model.initial_mean` is given."""
+    note: str = ""
+    """What a user should be told about the start; empty where there is nothing to say."""
+
+
+FindStart = Callable[[Recording, Mapping[str, Samples]], Start | None]
+
+
 class Parameters(NamedTuple):
     """Everything a run is estimated with that is not data: pytrees of arrays, so they have gradients."""
 
@@ -32,6 +45,8 @@ class Parameters(NamedTuple):
     """Clock offset, alignment, scale, lever arm, latency: what is not noise."""
     initial: Any
     """Standard deviations of the initial belief."""
+    setup: Any = ()
+    """What a recording itself tells of its run and nobody tunes: marker geometry, gravity, frames."""
 
 
 class Belief(NamedTuple):
@@ -62,6 +77,8 @@ class Sensor:
     """Group of each row; a gate accepts or rejects a group whole. None puts all rows in one group."""
     gate: float | None = None
     """Probability with which a good group passes the chi-square gate; None for no gate."""
+    aux_like: Any = None
+    """Auxiliary data of an ordinary sample, where it needs any: for samples that come without."""
 
     @property
     def rows(self) -> int:
@@ -126,6 +143,17 @@ class Model:
     initial_covariance: Callable[[Parameters], Array]
     start_with: tuple[str, ...] = ()
     """Sensors that must have been seen before the run can start."""
+    find_start: FindStart | None = None
+    """``find_start(recording, samples)``: where a run can start, from each sensor's samples while the
+    input lasts; None where it cannot. Without it a run starts when each of `start_with` is seen."""
+    adapt: Callable[[Sequence[Recording]], "Model"] | None = None
+    """The model as these recordings need it, such as with a sensor for each of their markers; the same
+    object for the same need."""
+    setup: Callable[[Recording], Any] | None = None
+    """``setup(recording)``: that part of the parameters which each recording tells itself; None for a
+    model without."""
+    patience_s: float = 0.5
+    """Seconds of refused samples, none let in, after which gates open and the belief is widened."""
     input: Input | None = None
     outputs: tuple[Output, ...] = ()
     project: Callable[[Any], Any] | None = None

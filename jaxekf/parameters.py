@@ -15,12 +15,19 @@ from jaxekf.files import write_whole
 from jaxekf.model import Model, Parameters
 from jaxekf.storage import SCHEMA_VERSION
 
-_SECTIONS = Parameters._fields
+_SECTIONS = ("noise", "calibration", "initial")
 
 
 def as_arrays(params: Parameters) -> Parameters:
     """The same tree with float arrays at its leaves."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+
+
+def for_runs(params: Parameters, setup: Any, runs: int) -> Parameters:
+    """The same parameters for each of several runs, on a new first axis, each with its own setup."""
+    shared = params._replace(setup=())
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), shared)
+    return every._replace(setup=setup)
 
 
 def leaf_names(section: Any) -> list[str]:

@@ -26,7 +26,7 @@ from jaxekf.truth import encoder_at, encoder_rate_at
 
 ESTIMATE, MEASURED, TRUTH, HELD = "#0b5394", "#e69138", "#222222", "#a61c00"
 _AXES = ("x", "y", "z")
-_STYLE: Any = {
+STYLE: Any = {
     "font.size": 9,
     "axes.grid": True,
     "grid.alpha": 0.25,
@@ -73,7 +73,7 @@ def save(figure: Figure, file: Path | str) -> Path:
 def _figure(
     rows: int, columns: int, size: tuple[float, float], **kwargs: Any
 ) -> tuple[Figure, Any]:
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=size, layout="constrained")
         return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
 
@@ -104,7 +104,7 @@ def _euler_deg(q: Floats) -> Floats:
     return np.rad2deg(np.unwrap(angles, axis=0))
 
 
-def _euler_sigma_deg(q: Floats, cov: Floats) -> Floats:
+def euler_sigma_deg(q: Floats, cov: Floats) -> Floats:
     """Standard deviation (N, 3) of roll, pitch and yaw from the body-frame covariance, degrees."""
     _, pitch, roll = to_scipy(q).as_euler("ZYX").T
     cosine = np.maximum(np.abs(np.cos(pitch)), 1e-3)
@@ -118,7 +118,8 @@ def _euler_sigma_deg(q: Floats, cov: Floats) -> Floats:
     return np.rad2deg(np.sqrt(np.einsum("nij,njk,nik->ni", slope, cov, slope)))
 
 
-def _band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None) -> None:
+def band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None) -> None:
+    """Two standard deviations about a curve."""
     axes.fill_between(
         t, centre - 2 * sigma, centre + 2 * sigma, color=ESTIMATE, alpha=0.22, lw=0, label=label
     )
@@ -138,13 +139,13 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
     optical = recording.need_optical()
     seen = optical.valid & (optical.time_ns >= estimate.time_ns[0])
     t, t_seen = estimate.time, _seconds(optical.time_ns[seen], estimate)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, grid = _figure(3, 2 if truth else 1, (11, 6.5), sharex=True)
         estimated, measured = (
             _euler_deg(estimate.attitude.value),
             _euler_deg(optical.q_ref_body[seen]),
         )
-        sigma = _euler_sigma_deg(estimate.attitude.value, estimate.attitude.cov)
+        sigma = euler_sigma_deg(estimate.attitude.value, estimate.attitude.cov)
         known = (
             None
             if truth is None
@@ -158,7 +159,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
                 axes.plot(t, known[:, i], color=TRUTH, lw=2.2, label="encoder")
             axes.plot(t, estimated[:, i], color=ESTIMATE, lw=1, label="estimate")
             if truth is None:
-                _band(axes, t, estimated[:, i], sigma[:, i], "2σ of the estimate")
+                band(axes, t, estimated[:, i], sigma[:, i], "2σ of the estimate")
             axes.set_ylabel(f"{name} (deg)")
         if truth is not None:
             _attitude_errors(grid[:, 1], estimate, recording, truth)
@@ -179,7 +180,7 @@ def _attitude_errors(column: Any, estimate: Estimate, recording: Recording, trut
         _shade_gaps(axes, estimate, recording)
         t_seen = _seconds(optical.time_ns[seen], estimate)
         axes.plot(t_seen, measured[:, i], ".", ms=2, color=MEASURED, alpha=0.6, label="tracker")
-        _band(axes, estimate.time, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
+        band(axes, estimate.time, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
         axes.plot(estimate.time, error[:, i], color=ESTIMATE, lw=1, label="estimate")
         axes.set_ylabel(f"error about {axis} (deg)")
         _limits(axes, np.r_[error[:, i], measured[:, i]])
@@ -195,16 +196,14 @@ def rate(estimate: Estimate, recording: Recording) -> Figure:
     known = None
     if recording.encoder is not None:
         known = np.rad2deg(encoder_rate_at(recording.encoder, estimate.time_ns))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, grid = _figure(3, 1 if known is None else 2, (11, 6.5), sharex=True)
         for i, axis in enumerate(_AXES):
             axes = grid[i, 0]
             _shade_gaps(axes, estimate, recording)
             axes.plot(t_imu, measured[:, i], color=MEASURED, lw=0.6, label="gyroscope")
             axes.plot(t, value[:, i], color=ESTIMATE, lw=0.8, label="estimate")
-            _band(
-                axes, t, value[:, i], sigma[:, i], "2σ of the estimate" if known is None else None
-            )
+            band(axes, t, value[:, i], sigma[:, i], "2σ of the estimate" if known is None else None)
             if known is not None:
                 axes.plot(t, known[:, i], color=TRUTH, lw=1.2, label="encoder")
             axes.set_ylabel(f"rate about {axis} (deg/s)")
@@ -219,7 +218,7 @@ def rate(estimate: Estimate, recording: Recording) -> Figure:
             error = value[:, i] - known[:, i]
             axes.plot(t_imu, raw, color=MEASURED, lw=0.6, label="gyroscope")
             axes.plot(t, error, color=ESTIMATE, lw=0.6, label="estimate")
-            _band(axes, t, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
+            band(axes, t, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
             axes.set_ylabel(f"error about {axis} (deg/s)")
             _limits(axes, np.r_[error, raw])
         _finish(figure, grid, f"{estimate.run}: angular rate of the tool, body frame")
@@ -237,7 +236,7 @@ def bias(estimate: Estimate, recording: Recording) -> Figure:
         true_rate = encoder_rate_at(recording.encoder, imu.time_ns[inside])
         difference = np.rad2deg(imu.gyroscope[inside] - true_rate)
         at_rest = _rest_value(t_imu, np.rad2deg(true_rate), difference)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, grid = _figure(3, 1, (9, 6.5), sharex=True)
         for i, axis in enumerate(_AXES):
             axes = grid[i, 0]
@@ -252,7 +251,7 @@ def bias(estimate: Estimate, recording: Recording) -> Figure:
             if at_rest is not None:
                 axes.axhline(at_rest[i], color=TRUTH, lw=1.2, ls="--", label="measured at rest")
             axes.plot(t, value[:, i], color=ESTIMATE, lw=1.2, label="estimate")
-            _band(axes, t, value[:, i], sigma[:, i], "2σ of the estimate")
+            band(axes, t, value[:, i], sigma[:, i], "2σ of the estimate")
             settled = t >= min(2.0, 0.1 * t[-1])
             middle, reach = np.median(value[settled, i]), 5.0 * np.median(sigma[settled, i])
             reach = max(reach, 2.0 * np.ptp(value[settled, i]))
@@ -304,14 +303,14 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
     t_hold = _seconds(dense, estimate)
     near_hold = (t_hold >= begin - margin) & (t_hold <= end + margin)
     near = (estimate.time >= begin - margin) & (estimate.time <= end + margin)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         known = recording.encoder is not None
         figure, grid = _figure(3, 2 if known else 1, (11, 6.5), sharex=True)
         held = hold_last(optical, dense)[near_hold]
         estimated = estimate.attitude.value[near]
         t, sigma = estimate.time[near], np.rad2deg(estimate.attitude.sigma[near])
         angles = [_euler_deg(held), _euler_deg(estimated)]
-        euler_sigma = _euler_sigma_deg(estimated, estimate.attitude.cov[near])
+        euler_sigma = euler_sigma_deg(estimated, estimate.attitude.cov[near])
         truth = encoder_at(recording.encoder, estimate.time_ns[near]) if recording.encoder else None
         for i, name in enumerate(("roll", "pitch", "yaw")):
             axes = grid[i, 0]
@@ -330,7 +329,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
                 )
             axes.plot(t, angles[1][:, i], color=ESTIMATE, lw=1.2, label="estimate")
             if truth is None:
-                _band(axes, t, angles[1][:, i], euler_sigma[:, i], "2σ of the estimate")
+                band(axes, t, angles[1][:, i], euler_sigma[:, i], "2σ of the estimate")
             axes.set_ylabel(f"{name} (deg)")
             axes.set_xlim(begin - margin, end + margin)
         if truth is not None:
@@ -348,7 +347,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
                     lw=1,
                     label="tracker held",
                 )
-                _band(axes, t, np.zeros(len(t)), sigma[:, i], "2σ of the estimate")
+                band(axes, t, np.zeros(len(t)), sigma[:, i], "2σ of the estimate")
                 axes.plot(t, error[:, i], color=ESTIMATE, lw=1.2, label="estimate")
                 axes.set_ylabel(f"error about {axis} (deg)")
                 reach = 1.3 * max(2.0 * sigma[:, i].max(), np.abs(error[:, i]).max(), 0.3)
@@ -382,7 +381,7 @@ def path(estimate: Estimate, recording: Recording) -> Figure:
     )
     estimated = 1e3 * to_scipy(estimate.attitude.value).apply(marker)
     truth = _truth(estimate, recording)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7, 6), layout="constrained")
         axes: Any = figure.add_subplot(projection="3d")
         if truth is not None:

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxekf import kernels
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
-from jaxekf.step import Moment, Outcome, predict, update
+from jaxekf.step import Moment, Outcome, Track, begin, predict, update
 from jaxekf.system import System
 
 _LARGEST_UNROLLED_SUBSTEPS = 2
@@ -36,6 +36,14 @@ class Given(NamedTuple):
     slow: Any
 
 
+class First(NamedTuple):
+    """What a run starts from."""
+
+    belief: Belief
+    refused: Array | None = None
+    """Seconds of refused samples before the start."""
+
+
 class Kept(NamedTuple):
     """What of every substep is kept; leading axes (K, S). None where it was not asked for."""
 
@@ -47,6 +55,10 @@ class Kept(NamedTuple):
     used: Any
     """By sensor; (K, S, rows) for fast sensors, (K, rows) for slow ones."""
     gated: Any
+    recovered: Array | None
+    """(K, S) where the gates were opened; None without gates."""
+    refused: Array | None
+    """(K, S) as in `Track`."""
 
 
 class What(NamedTuple):
@@ -60,53 +72,57 @@ class What(NamedTuple):
 def _keep(what: What, outcome: Outcome) -> Kept:
     return Kept(
         outcome.prior if what.prior else None,
-        outcome.posterior.mean,
-        outcome.posterior.cov if what.cov else None,
+        outcome.after.belief.mean,
+        outcome.after.belief.cov if what.cov else None,
         outcome.log_likelihood,
         outcome.healthy,
         outcome.used if what.used else {},
         outcome.gated if what.used else {},
+        outcome.recovered if what.used else None,
+        outcome.after.refused if what.used else None,
     )
 
 
 def _epoch(
-    system: System, what: What, adjoint: bool, prepared: Any, belief: Belief, given: Given
-) -> tuple[Belief, Kept]:
+    system: System, what: What, adjoint: bool, prepared: Any, track: Track, given: Given
+) -> tuple[Track, Kept]:
     """All substeps of one epoch; slow sensors are taken at the last."""
     count = given.moments.dt.shape[0] - 1
 
-    def ahead(belief: Belief, moment: Moment) -> Belief:
-        return predict(system, prepared, belief, moment, adjoint=adjoint)
+    def ahead(track: Track, moment: Moment) -> Track:
+        belief = predict(system, prepared, track.belief, moment, adjoint=adjoint)
+        return track._replace(belief=belief)
 
-    def take(prior: Belief, u: Any, samples: Any) -> tuple[Belief, Kept]:
-        outcome = update(system, prepared, prior, u, samples, adjoint=adjoint)
-        return outcome.posterior, _keep(what, outcome)
+    def take(ahead: Track, u: Any, samples: Any) -> tuple[Track, Kept]:
+        outcome = update(system, prepared, ahead, u, samples, adjoint=adjoint)
+        return outcome.after, _keep(what, outcome)
 
-    def substep(belief: Belief, at: Any) -> tuple[Belief, Kept]:
+    def substep(track: Track, at: Any) -> tuple[Track, Kept]:
         moment, samples = at
-        return take(ahead(belief, moment), moment.u, samples)
+        return take(ahead(track, moment), moment.u, samples)
 
     every = (given.moments, given.fast)
     moment, fast = jax.tree.map(lambda a: a[-1], every)
     if count and not given.fast:
         # One scan over all predictions: the transition is compiled once, not twice.
-        prior, kept = lax.scan(substep, belief, every)
-        belief, last = take(prior, moment.u, given.slow)
+        prior, kept = lax.scan(substep, track, every)
+        track, last = take(prior, moment.u, given.slow)
         earlier = jax.tree.map(lambda a: a[:-1], kept)
-        return belief, _gathered(earlier, last, given.slow)
+        return track, _gathered(earlier, last, given.slow)
     earlier = None
     if count:
         before = jax.tree.map(lambda a: a[:-1], every)
         unroll = count <= _LARGEST_UNROLLED_SUBSTEPS
-        belief, earlier = lax.scan(substep, belief, before, unroll=unroll)
-    belief, last = take(ahead(belief, moment), moment.u, fast | given.slow)
-    return belief, _gathered(earlier, last, given.slow)
+        track, earlier = lax.scan(substep, track, before, unroll=unroll)
+    track, last = take(ahead(track, moment), moment.u, fast | given.slow)
+    return track, _gathered(earlier, last, given.slow)
 
 
 def _gathered(earlier: Kept | None, last: Kept, slow: Any) -> Kept:
     """The substeps of an epoch one after the other; what slow sensors did apart from them."""
-    ended = [{name: v for name, v in part.items() if name in slow} for part in last[-2:]]
-    fast = [{name: v for name, v in part.items() if name not in slow} for part in last[-2:]]
+    both = (last.used, last.gated)
+    ended = [{name: v for name, v in part.items() if name in slow} for part in both]
+    fast = [{name: v for name, v in part.items() if name not in slow} for part in both]
     last = last._replace(used=fast[0], gated=fast[1])
     if earlier is None:
         whole = jax.tree.map(lambda a: a[None], last)
@@ -124,25 +140,26 @@ def _scan(
     adjoint: bool,
     segment: int | None,
     prepared: Any,
-    belief: Belief,
+    first: First,
     given: Given,
-) -> tuple[Kept, Belief | None]:
-    """All epochs; also, where `segment` is given, the belief at the start of every `segment` epochs."""
+) -> tuple[Kept, Track | None]:
+    """All epochs; also, where `segment` is given, the track at the start of every `segment` epochs."""
     epoch = partial(_epoch, system, what, adjoint, prepared)
+    track = begin(system, *first)
     if segment is None:
-        return lax.scan(epoch, belief, given)[1], None
+        return lax.scan(epoch, track, given)[1], None
 
-    def stretch(belief: Belief, given: Given) -> tuple[Belief, tuple[Kept, Belief]]:
+    def stretch(track: Track, given: Given) -> tuple[Track, tuple[Kept, Track]]:
         if segment == 1:
-            after, kept = epoch(belief, given)
+            after, kept = epoch(track, given)
         else:
-            after, kept = lax.scan(epoch, belief, given)
-        return after, (kept, belief)
+            after, kept = lax.scan(epoch, track, given)
+        return after, (kept, track)
 
     epochs = given.moments.dt.shape[0]
     if segment > 1:
         given = _cut(given, segment)
-    kept, starts = lax.scan(stretch, belief, given)[1]
+    kept, starts = lax.scan(stretch, track, given)[1]
     if segment > 1:
         kept = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], kept)
     return kept, starts
@@ -183,7 +200,7 @@ def _scan_back(
     segment: int,
     moving: tuple[bool, ...],
     live: tuple[bool, ...],
-    starts: Belief,
+    starts: Track,
     prepared: Any,
     given: Given,
     cotangents: list[Array],
@@ -199,13 +216,11 @@ def _scan_back(
         after, total = carry
         start, leaves, cotangents = at
 
-        def forward(floats: list[Array], belief: Belief, moved: list[Array]) -> Any:
+        def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
             full = _merge(moving, moved, leaves)
             values = moving_prepared(floats)
-            belief, kept = _epoch(
-                system, what, True, values, belief, jax.tree.unflatten(tree, full)
-            )
-            return belief, [v for f, v in zip(live, jax.tree.leaves(kept), strict=True) if f]
+            track, kept = _epoch(system, what, True, values, track, jax.tree.unflatten(tree, full))
+            return track, [v for f, v in zip(live, jax.tree.leaves(kept), strict=True) if f]
 
         moved = [v for f, v in zip(moving, leaves, strict=True) if f]
         _, pull = jax.vjp(forward, floats, start, moved)
@@ -217,23 +232,23 @@ def _scan_back(
     if segment == 1:
         given_back = (starts, leaves, cotangents)
         (first, total), of_given = lax.scan(back, carry, given_back, reverse=True)
-        return total, first, of_given
+        return total, first.belief, of_given
     epochs = given.moments.dt.shape[0]
     ahead = partial(_epoch, system, What(False, False, False), False, prepared)
 
     def stretch(carry: Any, at: Any) -> Any:
         start, leaves, cotangents = at
 
-        def step(belief: Belief, given: Given) -> tuple[Belief, Belief]:
-            return ahead(belief, given)[0], belief
+        def step(track: Track, given: Given) -> tuple[Track, Track]:
+            return ahead(track, given)[0], track
 
-        _, beliefs = lax.scan(step, start, jax.tree.unflatten(tree, leaves))
-        return lax.scan(back, carry, (beliefs, leaves, cotangents), reverse=True)
+        _, tracks = lax.scan(step, start, jax.tree.unflatten(tree, leaves))
+        return lax.scan(back, carry, (tracks, leaves, cotangents), reverse=True)
 
     pieces = (starts, _cut(leaves, segment), _cut(cotangents, segment))
     (first, total), of_given = lax.scan(stretch, carry, pieces, reverse=True)
     of_given = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], of_given)
-    return total, first, of_given
+    return total, first.belief, of_given
 
 
 def _inexact(tree: Any) -> tuple[list[Array], Callable[[list[Array]], Any]]:
@@ -261,17 +276,17 @@ def _whole(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def filter_plainly(
-    system: System, what: What, checkpoint: bool, prepared: Any, belief: Belief, given: Given
+    system: System, what: What, checkpoint: bool, prepared: Any, first: First, given: Given
 ) -> Kept:
     """The recursion with JAX's own derivatives, forward and reverse."""
 
-    def runs(_: None, prepared: Any, belief: Belief, given: Given) -> tuple[Kept, None]:
+    def runs(_: None, prepared: Any, first: First, given: Given) -> tuple[Kept, None]:
         epoch = partial(_epoch, system, what, False, prepared)
         if checkpoint:
             epoch = jax.checkpoint(epoch)
-        return lax.scan(epoch, belief, given)[1], None
+        return lax.scan(epoch, begin(system, *first), given)[1], None
 
-    return in_blocks((), runs, None, prepared, belief, given)[0]
+    return in_blocks((), runs, None, prepared, first, given)[0]
 
 
 def filter_with_adjoint(
@@ -280,11 +295,11 @@ def filter_with_adjoint(
     segment: int,
     devices: Devices,
     prepared: Any,
-    belief: Belief,
+    first: First,
     given: Given,
 ) -> Kept:
     """The recursion with its reverse derivative by the adjoint; `segment` epochs between kept beliefs."""
-    return _with_adjoint(system, what, segment, devices)(prepared, belief, given)
+    return _with_adjoint(system, what, segment, devices)(prepared, first, given)
 
 
 @lru_cache(maxsize=64)
@@ -304,20 +319,20 @@ def _with_adjoint(
     ahead_saving = over_more_runs(devices, partial(run, segment))
 
     @jax.custom_vjp
-    def function(prepared: Any, belief: Belief, given: Given) -> Kept:
-        return ahead(None, prepared, belief, given)[0]
+    def function(prepared: Any, first: First, given: Given) -> Kept:
+        return ahead(None, prepared, first, given)[0]
 
-    def forward(prepared: Any, belief: Belief, given: Given) -> Any:
+    def forward(prepared: Any, first: First, given: Given) -> Any:
         flags = tuple(
             bool(leaf.perturbed) and jnp.issubdtype(leaf.value.dtype, jnp.inexact)
             for leaf in jax.tree.leaves(given)
         )
-        values = jax.tree.map(lambda leaf: leaf.value, (prepared, belief, given))
+        values = jax.tree.map(lambda leaf: leaf.value, (prepared, first, given))
         kept, starts = ahead_saving(None, *values)
-        return kept, (values[0], starts, values[2], _Flags(flags))
+        return kept, (values[0], starts, values[2], _Flags(flags), first.refused is None)
 
     def backward(saved: Any, cotangents: Any) -> Any:
-        prepared, starts, given, flags = saved
+        prepared, starts, given, flags, at_rest = saved
         every = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
         live = tuple(
             not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
@@ -325,7 +340,10 @@ def _with_adjoint(
         chosen = [c for flag, c in zip(live, every, strict=True) if flag]
         back = _backward(system, what, segment, devices, flags.given, live)
         total, first, of_given = back(starts, prepared, given, chosen)[0]
-        return _unfilled(prepared, None, total), first, _unfilled(given, flags.given, of_given)
+        # When samples were refused decides what is let in, but nothing depends on it smoothly.
+        refused = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
+        back_to_given = _unfilled(given, flags.given, of_given)
+        return _unfilled(prepared, None, total), First(first, refused), back_to_given
 
     function.defvjp(forward, backward, symbolic_zeros=True)
     return function
@@ -340,7 +358,7 @@ def _backward(
     moving: tuple[bool, ...],
     live: tuple[bool, ...],
 ) -> Callable[..., Any]:
-    def scan(starts: Belief, *trees: Any) -> Any:
+    def scan(starts: Track, *trees: Any) -> Any:
         return _scan_back(system, what, segment, moving, live, starts, *trees), None
 
     def run(starts: Blocks, *trees: Any) -> Any:

@@ -69,6 +69,8 @@ class Estimate:
     account: dict[str, dict[str, int]]
     """For each stream the rows read, used, masked, gated and dropped."""
     params: Parameters
+    notes: tuple[str, ...] = ()
+    """What a user should know of how the run was read and started."""
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -98,7 +100,10 @@ class Estimate:
         ):
             if part.name == name:
                 return OutputEstimate(
-                    values, self.cov[:, part.error, part.error], "body", part.manifold.unit
+                    values,
+                    self.cov[:, part.error, part.error],
+                    part.manifold.frame,
+                    part.manifold.unit,
                 )
         names = [part.name for part in manifold.parts(self.model.space)]
         raise KeyError(f"got the state part '{name}', expected one of {names}; check the spelling")
@@ -127,6 +132,7 @@ class Estimate:
                 for name, record in self.sensors.items()
             },
             "account": self.account,
+            "notes": list(self.notes),
         }
 
     def save(self, path: Path | str, *, overwrite: bool = False) -> Path:
@@ -163,7 +169,7 @@ class Estimate:
         columns: list[dict[str, str]] = []
         blocks = [np.asarray(leaf) for leaf in jax.tree.leaves(self.state)]
         blocks.append(np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2)))
-        described = [("", self.model.space, "body")]
+        described = [("", self.model.space, "")]
         parts = {part.name for part in manifold.parts(self.model.space)}
         for name, output in self.outputs.items():
             if name in parts or (name == "attitude" and "q_ref_body" in parts):
@@ -193,17 +199,25 @@ class Estimate:
 
 
 def _describe(name: str, space: Any, frame: str) -> list[dict[str, str]]:
-    """Name, unit and frame of the columns of a state or output: its numbers, then their sigmas."""
+    """Name, unit and frame of the columns of a state or output: its numbers, then their sigmas.
+
+    Without a `frame` each part has its own.
+    """
     head = f"{name}_" if name else ""
     columns = []
     for part in manifold.parts(space):
         for label in part.manifold.component_labels:
             whole = "_".join(filter(None, (part.name, label)))
             quaternion = part.manifold.shape != (part.manifold.dim,)
-            unit, seen = ("1", "body to reference") if quaternion else (part.manifold.unit, frame)
+            own = frame or part.manifold.frame
+            unit, seen = ("1", "body to reference") if quaternion else (part.manifold.unit, own)
             columns.append({"name": f"{head}{whole}", "unit": unit, "frame": seen})
-    for label, unit in zip(manifold.error_labels(space), manifold.error_units(space), strict=True):
-        columns.append({"name": f"sigma_{head}{label}", "unit": unit, "frame": frame})
+    frames = [
+        frame or p.manifold.frame for p in manifold.parts(space) for _ in range(p.manifold.dim)
+    ]
+    described = zip(manifold.error_labels(space), manifold.error_units(space), frames, strict=True)
+    for label, unit, own in described:
+        columns.append({"name": f"sigma_{head}{label}", "unit": unit, "frame": own})
     return columns
 
 

@@ -152,7 +152,8 @@ def recording(
     )
 
 
-def _seconds(times: Times) -> Floats:
+def seconds(times: Times) -> Floats:
+    """Seconds since the first."""
     return (times - times[0]) / NANOSECONDS
 
 
@@ -167,7 +168,7 @@ def _optical(
     marker_body: tuple[float, float, float],
 ) -> Optical:
     times = sample_times(grade.optical_hz, duration_s, start_ns)
-    t = _seconds(times)
+    t = seconds(times)
     q, _ = motion.attitude(t)
     noise = np.deg2rad(grade.optical_deg) * rng.standard_normal((len(t), 3))
     measured = Rotation.from_quat(np.roll(q, -1, axis=1)) * Rotation.from_rotvec(noise)
@@ -184,7 +185,7 @@ def _imu(
     motion: Motion, grade: SensorGrade, rng: np.random.Generator, duration_s: float, start_ns: int
 ) -> Imu:
     times = sample_times(grade.imu_hz, duration_s, start_ns)
-    t = _seconds(times)
+    t = seconds(times)
     _, rate = motion.attitude(t)
     step = np.deg2rad(grade.bias_walk_deg) / np.sqrt(grade.imu_hz)
     bias = np.deg2rad(grade.bias_deg) * rng.standard_normal(3)
@@ -195,7 +196,7 @@ def _imu(
 
 def _encoder(motion: Motion, grade: SensorGrade, duration_s: float, start_ns: int) -> Encoder:
     times = sample_times(grade.encoder_hz, duration_s, start_ns)
-    q, _ = motion.attitude(_seconds(times))
+    q, _ = motion.attitude(seconds(times))
     known = np.ones(len(times), bool)
     return Encoder(times, q, known, known)
 

@@ -25,16 +25,36 @@ class Moment(NamedTuple):
     u: Any
 
 
+class Track(NamedTuple):
+    """What is carried from one substep to the next."""
+
+    belief: Belief
+    refused: Array | None
+    """(lanes,) seconds of samples that gates have refused since they last let one in; None without
+    gates."""
+
+
 class Outcome(NamedTuple):
     """What one substep leaves behind."""
 
     prior: Belief
-    posterior: Belief
+    after: Track
     log_likelihood: Array
     healthy: Array
     used: dict[str, Array]
     """By sensor: (rows, lanes) rows that entered the update."""
     gated: dict[str, Array]
+    recovered: Array | None
+    """(lanes,) where the gates were opened and the belief widened; None without gates."""
+
+
+def begin(system: System, belief: Belief, refused: Array | None) -> Track:
+    """The track at the start of a run, `refused` seconds (lanes,) into refusing samples; None for 0."""
+    if not system.is_gated:
+        return Track(belief, None)
+    if refused is None:
+        refused = jnp.zeros(belief.cov.shape[-1], belief.cov.dtype)
+    return Track(belief, refused)
 
 
 class _Linear(NamedTuple):
@@ -70,29 +90,31 @@ def predict(
 def update(
     system: System,
     prepared: Any,
-    prior: Belief,
+    ahead: Track,
     u: Any,
     samples: dict[str, Rows],
     *,
     adjoint: bool,
 ) -> Outcome:
     """Take every sensor sampled at the end of a substep; `adjoint` as in `predict`."""
-    linear: dict[str, _Linear] = {}
-    gated: dict[str, Array] = {}
+    prior = ahead.belief
+    seen: dict[str, _Linear] = {}
     for name, sample in samples.items():
         measurement = system.measurements[name]
         constants = prepared[f"sensor {name}"]
         found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
         residual, slope, noise = found
-        one = _hide(measurement, residual, slope, noise, sample.mask)
-        gated[name] = _gate(measurement.sensor, one, prior.cov)
-        linear[name] = _without(one, gated[name])
+        seen[name] = _hide(measurement, residual, slope, noise, sample.mask)
+    gates = _gates(system, seen, samples, ahead)
+    linear = {name: _without(one, gates.gated[name]) for name, one in seen.items()}
     used = {name: one.rows.mask for name, one in linear.items()}
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
-        nothing = jnp.zeros(lanes, dtype)
-        return Outcome(prior, prior, nothing, _is_sound(prior.cov), used, gated)
-    gained = Gained(prior.cov, jnp.zeros(prior.cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
+        nothing, sound = jnp.zeros(lanes, dtype), _is_sound(prior.cov)
+        never = None if ahead.refused is None else jnp.zeros(lanes, bool)
+        return Outcome(prior, ahead, nothing, sound, used, gates.gated, never)
+    cov = prior.cov if gates.widened is None else prior.cov * gates.widened[None, None]
+    gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
     for slope, rows in _blocks(system, linear):
         gained, pivot = _take(slope, gained, rows, adjoint)
@@ -101,7 +123,8 @@ def update(
         system, prepared["correction"], prior, gained, list(used.values()), adjoint
     )
     healthy = (smallest > 0.0) & _is_sound(posterior.cov)
-    return Outcome(prior, posterior, gained.log_likelihood, healthy, used, gated)
+    after = Track(posterior, gates.refused)
+    return Outcome(prior, after, gained.log_likelihood, healthy, used, gates.gated, gates.recovered)
 
 
 def _is_sound(cov: Array) -> Array:
@@ -135,14 +158,61 @@ def _without(linear: _Linear, gated: Array) -> _Linear:
     return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
 
 
-def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
-    """Visible rows whose group lies outside its chi-square bound."""
+class _Gates(NamedTuple):
+    """What the gates of all sensors make of the samples of one instant."""
+
+    gated: dict[str, Array]
+    refused: Array | None
+    recovered: Array | None
+    widened: Array | None
+    """(lanes,) what the predicted covariance is multiplied by."""
+
+
+def _gates(
+    system: System, seen: dict[str, _Linear], samples: dict[str, Rows], ahead: Track
+) -> _Gates:
+    """Rows that are kept out, and the way back for a belief that keeps everything out.
+
+    Where gates have let nothing in while they refused samples for longer than the model's patience, it
+    is the belief that is wrong: the gates open once, and the covariance is multiplied by how many
+    times larger than expected the squared errors are.
+    """
+    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in seen.items()}
+    watched = [n for n in seen if system.measurements[n].sensor.gate is not None]
+    prior = ahead.belief.cov
+    none = jnp.zeros(prior.shape[-1], bool)
+    if ahead.refused is None:
+        return _Gates(gated, None, None, None)
+    if not watched:
+        return _Gates(gated, ahead.refused, none, None)
+    let_in, kept_out, finite = none, none, {}
+    refused_s, excess = jnp.zeros_like(ahead.refused), jnp.ones_like(ahead.refused)
+    for name in watched:
+        rows = seen[name].rows
+        gated[name], ratio = _gate(system.measurements[name].sensor, seen[name], prior)
+        finite[name] = gated[name] & (jnp.stack(ratio) < jnp.inf)
+        for row in range(rows.mask.shape[0]):
+            let_in = let_in | (rows.mask[row] & ~gated[name][row])
+            kept_out = kept_out | finite[name][row]
+            larger = jnp.maximum(excess, ratio[row])
+            excess = jnp.where(finite[name][row], larger, excess)
+            late = jnp.maximum(refused_s, samples[name].dt)
+            refused_s = jnp.where(finite[name][row], late, refused_s)
+    refused = jnp.where(let_in, 0.0, ahead.refused + refused_s)
+    recovered = kept_out & (refused > system.model.patience_s)
+    gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
+    widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
+    return _Gates(gated, jnp.where(recovered, 0.0, refused), recovered, widened)
+
+
+def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> tuple[Array, list[Array]]:
+    """Visible rows whose group lies outside its chi-square bound; and for each row how many times
+    larger than expected its group's squared error is."""
     rows = linear.rows
-    if sensor.gate is None:
-        return jnp.zeros_like(rows.mask)
     cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
     cov = linalg.mask_covariance(cov, rows.mask)
     outside: list[Any] = [None] * sensor.rows
+    ratios: list[Any] = [None] * sensor.rows
     for members in sensor.group_rows:
         residual = jnp.stack([rows.residual[i] for i in members])
         shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
@@ -155,9 +225,10 @@ def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> Array:
             bound = jnp.where(visible == count, bounds[count], bound)
         # A distance that is NaN is outside too: such a row must not enter the update.
         rejected = jnp.logical_not(distance <= bound)
+        ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)
         for row in members:
-            outside[row] = rejected
-    return lax.stop_gradient(jnp.stack(outside) & rows.mask)
+            outside[row], ratios[row] = rejected, lax.stop_gradient(ratio)
+    return lax.stop_gradient(jnp.stack(outside) & rows.mask), ratios
 
 
 def _take(

@@ -157,6 +157,11 @@ class System:
         return found
 
     @property
+    def is_gated(self) -> bool:
+        """Whether any sensor has a gate."""
+        return any(m.sensor.gate is not None for m in self.measurements.values())
+
+    @property
     def is_plain(self) -> bool:
         """Whether all functions of the model are arithmetic only, so that all steps are one program."""
         pieces = [m.piece for m in self.measurements.values()]

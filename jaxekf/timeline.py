@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf.errors import ModelError, RecordingError
-from jaxekf.model import Model, Sensor
+from jaxekf.model import Model, Sensor, Start
 from jaxekf.recording import NANOSECONDS, Recording, Samples, Times, period_ns
 
 _UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
@@ -76,6 +76,12 @@ class Timeline:
     """First visible sample of each sensor."""
     account: dict[str, dict[str, int]] = field(default_factory=dict)
     """For each stream: rows read, fed to the filter, masked, and dropped by reason."""
+    notes: tuple[str, ...] = ()
+    """What a user should know of how the run was read."""
+    setup: Any = ()
+    """`Parameters.setup` of this run."""
+    latency_ns: dict[str, int] = field(default_factory=dict)
+    """How late each sensor's samples were known."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -95,7 +101,7 @@ def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = Non
     driver = None
     if model.input is not None:
         driver = _check_input(model.input.source(recording), recording, model.input.name)
-    start, end = _span(model, recording, samples, driver)
+    start, end, found = _span(model, recording, samples, driver)
     account = {name: _count(stream, start, end) for name, stream in samples.items()}
     if driver is not None and model.input is not None:
         account[model.input.name] = _count(driver, start, end)
@@ -113,8 +119,12 @@ def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = Non
     steps, step_times = _lay_out(times, index, samples, slow, start)
     if driver is not None:
         steps = steps._replace(knots=_knots(driver, start))
-    first = {name: _first_visible(stream) for name, stream in samples.items()}
-    return Timeline(recording.name, steps, step_times, first, account)
+    if found is None:
+        found = Start(start, {name: _first_visible(stream) for name, stream in samples.items()})
+    notes = (found.note,) if found.note else ()
+    latency = {name: stream.latency_ns for name, stream in samples.items()}
+    setup = model.parameters.setup if model.setup is None else model.setup(recording)
+    return Timeline(recording.name, steps, step_times, found.first, account, notes, setup, latency)
 
 
 def build_many(model: Model, recordings: Sequence[Recording]) -> list[Timeline]:
@@ -143,7 +153,7 @@ def _read(sensor: Sensor, recording: Recording) -> Samples:
     if mask.ndim == 1:
         mask = np.repeat(mask[:, None], sensor.rows, axis=1)
     aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)
-    return Samples(samples.time_ns, samples.value, mask, aux)
+    return Samples(samples.time_ns, samples.value, mask, aux, samples.latency_ns)
 
 
 def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
@@ -206,7 +216,7 @@ def _describe(times: Times) -> str:
 
 def _span(
     model: Model, recording: Recording, samples: dict[str, Samples], driver: Samples | None
-) -> tuple[int, int]:
+) -> tuple[int, int, Start | None]:
     """First and last time of the run: from the first usable samples to where the input ends."""
     place = recording.path or recording.name
     start = min(int(s.time_ns[0]) for s in samples.values())
@@ -235,7 +245,18 @@ def _span(
                 "a run in which the tool is seen",
             )
         start = max(start, int(seen[0]))
-    return start, end
+    if model.find_start is None:
+        return start, end, None
+    inside = {name: _cut(stream, start, end) for name, stream in samples.items()}
+    found = model.find_start(recording, inside)
+    if found is None:
+        raise RecordingError(
+            place,
+            f"no instant at which '{model.name}' can start",
+            "at least one (see the model)",
+            "a run in which enough of the tool is seen at once",
+        )
+    return found.time_ns, end, found
 
 
 def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
@@ -267,7 +288,11 @@ def _take(samples: Samples, chosen: NDArray[Any]) -> Samples:
         return jax.tree.map(lambda a: np.asarray(a)[chosen], tree)
 
     return Samples(
-        samples.time_ns[chosen], pick(samples.value), samples.mask[chosen], pick(samples.aux)
+        samples.time_ns[chosen],
+        pick(samples.value),
+        samples.mask[chosen],
+        pick(samples.aux),
+        samples.latency_ns,
     )
 
 

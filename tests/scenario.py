@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from jaxekf import ekf, jit
 from jaxekf.model import Parameters
 from jaxekf.models import loose, loose_additive, loose_rate
-from jaxekf.recording import Imu, Optical, Recording, from_scipy
+from jaxekf.recording import Imu, Markers, Optical, Recording, from_scipy
 from jaxekf.timeline import Knots, Rows, Steps
 
+ARMS = np.array([[0.02, 0.0, 0.01], [0.1, 0.01, 0.0], [0.0, 0.09, -0.02]])
 BIAS = np.array([0.02, -0.015, 0.01])
 
 
@@ -104,6 +105,11 @@ def smooth_motion(seed):
     return Motion(
         rng.uniform(0.3, 0.8, shape), rng.uniform(1.0, 3.0, shape), rng.uniform(0, 6, shape)
     )
+
+
+def rotation_of(q):
+    """SciPy's rotations of quaternions (N, 4)."""
+    return Rotation.from_quat(np.roll(q, -1, axis=1))
 
 
 class Run(NamedTuple):
@@ -228,11 +234,21 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
     noise = 0.01 * rng.standard_normal((len(t), 3))
     gyroscope = scale * (motion.rate(t) + BIAS + noise)
     up = Rotation.from_rotvec(motion.vector(t)).inv().apply([0.0, 0.0, 9.81])
+    gravity = np.array([0.0, 0.0, -9.81])
     if turn is not None:
         rotation = Rotation.from_quat(np.roll(turn, -1))
         q = from_scipy(rotation * Rotation.from_quat(np.roll(q, -1, axis=1)))
         gyroscope = rotation.apply(gyroscope) if turn_rate else gyroscope
+        gravity = rotation.apply(gravity)
     valid = np.ones(len(q), bool)
     valid[1 + seed % 5] = False
     optical = Optical(start_ns + optical_ns, q, valid, np.zeros((len(q), 3)))
-    return Recording("simulated", optical, Imu(start_ns + imu_ns, gyroscope, up))
+    blur = scale * 2e-4 * rng.standard_normal((len(q), 3, 3))
+    seen = np.stack([rotation_of(q).apply(arm) for arm in ARMS], axis=1) + blur
+    visible = valid[:, None] & np.ones((1, 3), bool)
+    visible[1 + (seed + 2) % 5, 1] = False
+    markers = Markers(start_ns + optical_ns, seen, visible, ("1", "2", "3"), ARMS)
+    info = {"gravity_ref": gravity.tolist()}
+    return Recording(
+        "simulated", optical, Imu(start_ns + imu_ns, gyroscope, up), None, info, markers=markers
+    )

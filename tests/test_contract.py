@@ -63,13 +63,20 @@ def run_epochs(model, given):
 
 @partial(scenario.quick_jit, static_argnums=0)
 def evaluate(model, params, mean, steps):
-    """The gradient of log-likelihood and means to all parameters; and the output."""
+    """The gradient of log-likelihood, means and outputs to all parameters; and the filter's output."""
 
     def loss(params):
         output = ekf.run_filter(model, params, start(model, params, mean), steps)
-        means = jax.tree.leaves(output.instants.updated.mean)
+        found = jax.tree.leaves(output.instants.updated.mean)
+        for out in model.outputs:
+
+            def value(x, u, out=out):
+                return out.value(x, u, params)
+
+            told = jax.vmap(jax.vmap(value))(output.instants.updated.mean, output.inputs)
+            found += jax.tree.leaves(told)
         total = jnp.sum(output.instants.log_likelihood)
-        return total + sum(jnp.sum(jnp.sin(leaf + 0.3)) for leaf in means), output
+        return total + sum(jnp.sum(jnp.sin(leaf + 0.3)) for leaf in found), output
 
     return jax.grad(loss, has_aux=True)(params)
 

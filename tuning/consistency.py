@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf import parameters
 from jaxekf.errors import TuningError
 from jaxekf.estimation import evaluate_outputs
 from jaxekf.kernels import jit
@@ -20,7 +20,7 @@ def _nees(model: Model, params: Parameters, data: Data) -> tuple[Array, Array]:
     """Sum of normalised squared attitude errors over all judged instants, and of degrees of freedom."""
     output = run_batch(model, params, data, "estimates")
     runs = data.steps.dt.shape[0]
-    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    every = parameters.for_runs(params, data.setup, runs)
     error = output_error(model, params, output, data, "attitude")
     _, cov = evaluate_outputs(model, every, output)["attitude"]
     judged = data.truth["attitude"].judged

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxekf import padding, storage, timeline
+from jaxekf import padding, timeline
 from jaxekf.errors import TuningError
-from jaxekf.estimation import Run
+from jaxekf.estimation import Run, read
 from jaxekf.model import Model
 from jaxekf.recording import Recording
 from jaxekf.timeline import Steps, Timeline
@@ -30,6 +30,8 @@ class Data(NamedTuple):
 
     means: Any
     """Initial mean of each run."""
+    setup: Any
+    """`Parameters.setup` of each run."""
     steps: Steps
     truth: dict[str, Truth]
     counted: Any
@@ -65,7 +67,7 @@ def prepare_groups(
 def _read(model: Model, runs: Sequence[Run]) -> tuple[list[Recording], list[Timeline]]:
     if not runs:
         raise TuningError("got no run to tune on, expected at least one; name some recordings")
-    recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
+    recordings = read(runs)
     return recordings, timeline.build_many(model, recordings)
 
 
@@ -87,9 +89,9 @@ def _stack(
     model: Model, recordings: Sequence[Recording], lines: Sequence[Timeline], burn_in_s: float
 ) -> Data:
     steps = padding.bucketed(lines)
-    means = [model.initial_mean(line.first) for line in lines]
+    starts = [(model.initial_mean(line.first), line.setup) for line in lines]
     shape = steps.dt.shape
-    names = [out.name for out in model.outputs if out.name in ("attitude", "rate")]
+    names = [out.name for out in model.outputs if out.name in ("attitude", "rate", "position")]
     truth = {name: Truth(_blank(name, shape), np.zeros(shape, bool)) for name in names}
     counted = np.zeros(shape, bool)
     for i, (recording, line) in enumerate(zip(recordings, lines, strict=True)):
@@ -102,13 +104,13 @@ def _stack(
             if name in truth:
                 truth[name].value[place] = value
                 truth[name].judged[place] = known & settled
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *means)
-    return jax.tree.map(jnp.asarray, Data(stacked, steps, truth, counted))
+    means, setup = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    return jax.tree.map(jnp.asarray, Data(means, setup, steps, truth, counted))
 
 
 def _blank(name: str, shape: tuple[int, ...]) -> Any:
-    """Truth before it is filled in: no turn, no rate."""
-    if name == "rate":
+    """Truth before it is filled in: no turn, no rate, the origin."""
+    if name != "attitude":
         return np.zeros((*shape, 3))
     blank = np.zeros((*shape, 4))
     blank[..., 0] = 1.0
@@ -116,14 +118,19 @@ def _blank(name: str, shape: tuple[int, ...]) -> Any:
 
 
 def _truth(recording: Recording, line: Timeline) -> dict[str, tuple[Any, Any]]:
-    """Attitude and body rate of the encoder at every instant of a timeline, and where known."""
+    """What the encoder knows at every instant of a timeline, and where: attitude, rate, position."""
     flat = line.time_ns.reshape(-1)
     encoder = recording.need_encoder()
     at = encoder_at(encoder, flat)
     rate = encoder_rate_at(encoder, flat)
     known = np.isfinite(rate).all(axis=1) & at.scored
     shape = line.time_ns.shape
-    return {
+    found = {
         "attitude": (at.q_ref_body.reshape(*shape, 4), at.scored.reshape(shape)),
         "rate": (np.where(known[:, None], rate, 0.0).reshape(*shape, 3), known.reshape(shape)),
     }
+    if at.position is not None:
+        there = np.isfinite(at.position).all(axis=1) & at.scored
+        position = np.where(there[:, None], at.position, 0.0).reshape(*shape, 3)
+        found["position"] = (position, there.reshape(shape))
+    return found

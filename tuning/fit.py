@@ -15,10 +15,10 @@ from jax import Array
 
 from jaxekf import parameters
 from jaxekf.errors import TuningError
-from jaxekf.estimation import Run, provenance, require_float64
+from jaxekf.estimation import Run, provenance, read, require_float64
 from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
-from jaxekf.models import get_model
+from jaxekf.models import adapted, get_model
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import Recording
 from tuning import consistency
@@ -122,7 +122,8 @@ def tune(
     Raises `TuningError` where the problem is ill-posed, and what `estimate` raises for bad data.
     """
     require_float64()
-    chosen = get_model(model)
+    learnt, judging = read(runs), read(validate)
+    chosen = adapted(get_model(model), [*learnt, *judging])
     aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
     base = as_arrays(chosen.parameters if start is None else start)
     if axes is not None:
@@ -130,10 +131,10 @@ def tune(
     where = layout(chosen, base, free)
     _check_runs(runs, validate)
     need_truth = bool(aim.errors)
-    training = prepare_groups(chosen, runs, burn_in_s=burn_in_s, need_truth=need_truth)
+    training = prepare_groups(chosen, learnt, burn_in_s=burn_in_s, need_truth=need_truth)
     held_out = None
     if validate:
-        held_out = prepare_groups(chosen, validate, burn_in_s=burn_in_s, need_truth=need_truth)
+        held_out = prepare_groups(chosen, judging, burn_in_s=burn_in_s, need_truth=need_truth)
     search = _Search(chosen, aim, where, base, training, held_out)
     best_free, best, history, stopped = search.run(optimiser, iterations, patience, progress)
     params = where.from_free(best_free, base)

@@ -110,10 +110,10 @@ def layout(model: Model, params: Parameters, free: Sequence[str] | None = None) 
         raise TuningError("got nothing that is free, expected some parameters; name noise, for one")
     chosen: list[str] = []
     for name in wanted:
-        found = [n for n in values if n == name or n.startswith(f"{name}.")]
+        found = [n for n in units if n == name or n.startswith(f"{name}.")]
         if not found:
             raise TuningError(
-                f"got the free parameter '{name}', expected some of {list(values)};"
+                f"got the free parameter '{name}', expected some of {list(units)};"
                 " check the spelling"
             )
         chosen += [n for n in found if n not in chosen]

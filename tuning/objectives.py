@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import ekf, manifold
+from jaxekf import ekf, manifold, parameters
 from jaxekf.errors import TuningError
 from jaxekf.estimation import sharing_devices
 from jaxekf.model import Belief, Model, Parameters
@@ -23,7 +23,8 @@ class Objective:
     """A weighted sum of mean squared errors against truth and of innovation likelihood.
 
     ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``; attitude
-    errors are geodesic angles in degrees, rate errors in deg/s. Add two objectives to combine them.
+    errors are geodesic angles in degrees, rate errors in deg/s, position errors in mm. Add two objectives
+    to combine them.
     """
 
     errors: tuple[tuple[str, float], ...] = ()
@@ -64,6 +65,11 @@ def rate_error() -> Objective:
     return Objective((("rate", 1.0),))
 
 
+def position_error() -> Objective:
+    """Mean squared position error, mm^2."""
+    return Objective((("position", 1.0),))
+
+
 def innovation_likelihood() -> Objective:
     """Negative log-likelihood of the innovations, per measured row; needs no truth."""
     return Objective(likelihood=1.0)
@@ -72,6 +78,7 @@ def innovation_likelihood() -> Objective:
 NAMED = {
     "attitude": attitude_error,
     "rate": rate_error,
+    "position": position_error,
     "likelihood": innovation_likelihood,
 }
 
@@ -96,7 +103,7 @@ def run_batch(
 ) -> ekf.FilterOutput:
     """The filter over all runs with shared parameters."""
     runs = data.steps.dt.shape[0]
-    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), params)
+    every = parameters.for_runs(params, data.setup, runs)
     cov = jax.vmap(model.initial_covariance)(every)
     belief = Belief(data.means, cov)
     return ekf.run_filter_batch(
@@ -104,13 +111,19 @@ def run_batch(
     )
 
 
-def output_values(model: Model, params: Parameters, output: ekf.FilterOutput, name: str) -> Any:
+def output_values(
+    model: Model, params: Parameters, setup: Any, output: ekf.FilterOutput, name: str
+) -> Any:
     """One of the model's outputs at every instant, leading axes (runs, K, S)."""
 
-    def value(x: Any, u: Any) -> Any:
-        return model.output(name).value(x, u, params)
+    def of_run(setup: Any, means: Any, inputs: Any) -> Any:
+        def value(x: Any, u: Any) -> Any:
+            return model.output(name).value(x, u, params._replace(setup=setup))
 
-    return jax.vmap(jax.vmap(jax.vmap(value)))(output.instants.updated.mean, output.inputs)
+        return jax.vmap(jax.vmap(value))(means, inputs)
+
+    runs = output.instants.log_likelihood.shape[0]
+    return jax.vmap(of_run, axis_size=runs)(setup, output.instants.updated.mean, output.inputs)
 
 
 def evaluate(
@@ -174,8 +187,7 @@ def terms(
         error = output_error(model, params, output, data, name)
         judged = data.truth[name].judged
         squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
-        scale = _DEGREES_SQUARED if _is_angular(model, name) else 1.0
-        found[name] = scale * squared / jnp.maximum(counts[name], 1)
+        found[name] = _scale(model, name) * squared / jnp.maximum(counts[name], 1)
     return found
 
 
@@ -189,7 +201,7 @@ def output_error(
             f" '{model.name}' puts out and the encoder knows; choose another objective"
         )
     space = model.output(name).space
-    values = output_values(model, params, output, name)
+    values = output_values(model, params, data.setup, output, name)
 
     def error(value: Any, truth: Any) -> Array:
         return manifold.local(space, value, truth)
@@ -197,8 +209,10 @@ def output_error(
     return jax.vmap(jax.vmap(jax.vmap(error)))(values, data.truth[name].value)
 
 
-def _is_angular(model: Model, name: str) -> bool:
-    return manifold.error_units(model.output(name).space)[0].startswith("rad")
+def _scale(model: Model, name: str) -> float:
+    """From the squared unit of an output to deg^2, (deg/s)^2 or mm^2."""
+    unit = manifold.error_units(model.output(name).space)[0]
+    return _DEGREES_SQUARED if unit.startswith("rad") else 1e6 if unit == "m" else 1.0
 
 
 def _visible_rows(data: Data) -> Array:

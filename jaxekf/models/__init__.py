@@ -3,14 +3,28 @@
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 
 from jaxekf.errors import ModelError
 from jaxekf.model import Model
-from jaxekf.models import loose, loose_additive, loose_rate
+from jaxekf.models import loose, loose_additive, loose_pose, loose_rate, tight
+from jaxekf.recording import Recording
 
 REGISTRY: dict[str, Model] = {
-    model.name: model for model in (loose.MODEL, loose_rate.MODEL, loose_additive.MODEL)
+    model.name: model
+    for model in (
+        loose.MODEL,
+        loose_rate.MODEL,
+        loose_additive.MODEL,
+        loose_pose.MODEL,
+        tight.MODEL,
+    )
 }
+
+
+def adapted(model: Model, recordings: Sequence[Recording]) -> Model:
+    """The model as these recordings need it."""
+    return model if model.adapt is None else model.adapt(recordings)
 
 
 def get_model(model: str | Model) -> Model:

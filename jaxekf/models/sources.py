@@ -2,16 +2,49 @@
 
 import numpy as np
 
-from jaxekf.recording import Recording, Samples
+from jaxekf.errors import RecordingError
+from jaxekf.recording import Floats, Optical, Recording, Samples, to_scipy
 
 
 def optical_attitude(recording: Recording) -> Samples:
     """The tracker's attitude, quaternions (N, 4), hidden samples masked."""
     optical = recording.need_optical()
-    return Samples(optical.time_ns, optical.q_ref_body, optical.valid)
+    taken = optical.time_ns - optical.latency_ns
+    return Samples(taken, optical.q_ref_body, optical.valid, latency_ns=optical.latency_ns)
 
 
 def gyroscope(recording: Recording) -> Samples:
     """The gyroscope's rate (N, 3), rad/s, body frame."""
     imu = recording.need_imu()
     return Samples(imu.time_ns, imu.gyroscope, np.ones(len(imu.time_ns), bool))
+
+
+def imu(recording: Recording) -> Samples:
+    """Gyroscope and accelerometer (N, 6), rad/s and m/s^2, body frame."""
+    stream = recording.need_imu()
+    if stream.accelerometer is None:
+        raise RecordingError(
+            recording.path or recording.name,
+            "an IMU without accelerometer",
+            "one for a model of position",
+            "adding ax,ay,az to imu.csv, or the model loose",
+        )
+    both = np.concatenate([stream.gyroscope, stream.accelerometer], axis=1)
+    return Samples(stream.time_ns, both, np.asarray(np.isfinite(both).all(axis=1)))
+
+
+def tracked_position(optical: Optical, recording: Recording) -> Floats:
+    """The tracker's position (N, 3), or an error that names the run where it has attitude only."""
+    if optical.position is None:
+        raise RecordingError(
+            recording.path or recording.name,
+            "a tracker without position",
+            "one for a model of position",
+            "adding x,y,z to optical.csv, or the model loose",
+        )
+    return optical.position
+
+
+def turned(q_ref_body: Floats, vector: Floats) -> Floats:
+    """A body vector (3,) in the reference frame at each of the attitudes (N, 4)."""
+    return to_scipy(q_ref_body).apply(vector)

@@ -1,0 +1,211 @@
+"""Position, attitude, velocity and IMU biases, driven by the IMU: what `tight` and `loose_pose` share.
+
+Tobergte, Pomarlan, Hirzinger (2009), eqs. 18 to 22, in the conventions of this package: the body is the
+IMU's frame, errors of attitude act on the right, gravity is free fall. Their eq. 19 multiplies by
+``[0, t_s w]`` where the exponential belongs, and eqs. 21 and 22 have no noise: biases walk here.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, pose, rotation
+from jaxekf.interpolation import InputSample
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Output, Parameters
+from jaxekf.recording import Recording
+
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+
+
+class State(NamedTuple):
+    """The IMU in the tracker's reference frame, and what it measures wrongly."""
+
+    position: Any
+    q_ref_body: Any
+    velocity: Any
+    bias: Any
+    """Of the gyroscope."""
+    accelerometer_bias: Any
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    position: Any
+    """About the first pose, which is then used as a measurement: keep it and the attitude wide."""
+    attitude: Any
+    velocity: Any
+    bias: Any
+    """About zero."""
+    accelerometer_bias: Any
+    """About zero."""
+
+
+class Calibration(NamedTuple):
+    """What is not random and not stated by a recording; corrections of what it states."""
+
+    latency: Any
+    """Seconds that the tracker's samples are older than they are said to be; ()."""
+    lever_arm: Any
+    """Metres from where the tool's frame is said to be in the body to where it is, body frame; (3,)."""
+    alignment: Any
+    """Rotation vector from the tool's frame as it is said to be to what it is, body frame, rad; (3,)."""
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run."""
+
+    gravity_ref: Any
+    """(3,) free fall in the reference frame, m/s^2."""
+    p_body_object: Any
+    """(3,) metres: the point of the tool whose pose is asked for."""
+    q_body_object: Any
+    """(4,) object to body: the frame of the tool whose attitude is asked for."""
+
+
+SPACE: Any = State(
+    Euclidean(3, "m", frame="reference"),
+    SO3(),
+    Euclidean(3, "m/s", frame="reference"),
+    Euclidean(3, "rad/s"),
+    Euclidean(3, "m/s^2"),
+)
+
+INITIAL = Initial(
+    position=0.01,
+    attitude=np.deg2rad(5.0),
+    velocity=0.3,
+    bias=np.deg2rad(1.0),
+    accelerometer_bias=0.2,
+)
+INITIAL_UNITS = Initial("m", "rad", "m/s", "rad/s", "m/s^2")
+
+CALIBRATION = Calibration(latency=np.array(0.0), lever_arm=np.zeros(3), alignment=np.zeros(3))
+CALIBRATION_UNITS = Calibration("s", "m", "rad")
+
+SETUP = Setup(np.array(STANDARD_GRAVITY), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
+    """The IMU carried on by its mean rate and specific force over ``dt``, both constant in the body.
+
+    While the body turns by ``theta`` the force turns with it: its integrals over the step are
+    ``f + theta x f / 2 + theta x (theta x f) / 6`` times dt, and ``f / 2 + theta x f / 6 +
+    theta x (theta x f) / 24`` times dt^2, up to ``theta^3``. ``w`` holds angle, velocity, and the changes
+    of both biases.
+    """
+    force = u.mean[3:] - x.accelerometer_bias
+    turn = (u.mean[:3] - x.bias) * dt
+    once = jnp.cross(turn, force)
+    twice = jnp.cross(turn, once)
+    gained = (force + once / 2.0 + twice / 6.0) * dt + w[3:6]
+    moved = (force / 2.0 + once / 6.0 + twice / 24.0) * dt * dt + 0.5 * dt * w[3:6]
+    fall = params.setup.gravity_ref * dt
+    return State(
+        x.position + (x.velocity + 0.5 * fall) * dt + rotation.rotate(x.q_ref_body, moved),
+        SO3().retract(x.q_ref_body, turn + w[:3]),
+        x.velocity + fall + rotation.rotate(x.q_ref_body, gained),
+        x.bias + w[6:9],
+        x.accelerometer_bias + w[9:],
+    )
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (12, 12) of angle, velocity and bias noise over ``dt``, in the IMU's axes."""
+    noise = params.noise
+    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
+    return dt * block_diagonal([linalg.covariance(d, 3) for d in densities])
+
+
+def block_diagonal(blocks: list[Array]) -> Array:
+    """Square matrices (3, 3) on a diagonal."""
+    zero = jnp.zeros((3, 3))
+    rows = [[b if i == j else zero for j in range(len(blocks))] for i, b in enumerate(blocks)]
+    return jnp.block(rows)
+
+
+def initial_covariance(params: Parameters) -> Array:
+    """Covariance (15, 15)."""
+    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
+
+
+def initial_mean(first: Any) -> State:
+    """The pose and velocity found at the start (the origin where there are none), no biases."""
+    zero = jnp.zeros(3)
+    return State(
+        jnp.asarray(first.get("position", zero)),
+        jnp.asarray(first.get("q_ref_body", rotation.identity())),
+        jnp.asarray(first.get("velocity", zero)),
+        zero,
+        zero,
+    )
+
+
+def setup(recording: Recording, raw: Any) -> Setup:
+    """Gravity and object frame of a recording; gravity found from its poses `raw` where not stated."""
+    info = recording.info
+    stated = info.get("gravity_ref")
+    if stated is None:
+        stated = pose.gravity(raw, recording.need_imu(), recording.path or recording.name)
+    frame = np.asarray(info.get("q_body_object", SETUP.q_body_object), float)
+    return Setup(
+        np.asarray(stated, float),
+        np.asarray(info.get("p_body_object", SETUP.p_body_object), float),
+        frame / np.linalg.norm(frame),
+    )
+
+
+def clock_offset(params: Parameters) -> Array:
+    """The IMU's time of an instant of the tracker's: earlier by the latency not accounted for."""
+    return -params.calibration.latency
+
+
+def _rate(x: State, u: InputSample) -> Array:
+    return u.value[:3] - x.bias
+
+
+def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
+    swing = jnp.cross(_rate(x, u), params.setup.p_body_object)
+    return x.velocity + rotation.rotate(x.q_ref_body, swing)
+
+
+def rate_noise(u: InputSample, params: Parameters) -> Array:
+    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    return linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth
+
+
+def _object_velocity_noise(u: InputSample, params: Parameters) -> Array:
+    """Covariance (3, 3) that the gyroscope's own sample puts on the object's velocity, at most.
+
+    The same in all directions, as the attitude is not known here.
+    """
+    arm = params.setup.p_body_object
+    each = linalg.diagonal(rate_noise(u, params))
+    return jnp.sum(arm * arm) * jnp.max(each) * jnp.eye(3)
+
+
+_IN_REFERENCE = Euclidean(3, "m", frame="reference")
+_SPEED = Euclidean(3, "m/s", frame="reference")
+
+OUTPUTS = (
+    Output("position", _IN_REFERENCE, "reference", lambda x, u, params: x.position),
+    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+    Output("velocity", _SPEED, "reference", lambda x, u, params: x.velocity),
+    Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: _rate(x, u), rate_noise),
+    Output(
+        "object_position",
+        _IN_REFERENCE,
+        "reference",
+        lambda x, u, params: x.position + rotation.rotate(x.q_ref_body, params.setup.p_body_object),
+    ),
+    Output(
+        "object_attitude",
+        SO3(),
+        "object",
+        lambda x, u, params: rotation.product(x.q_ref_body, params.setup.q_body_object),
+    ),
+    Output("object_velocity", _SPEED, "reference", _object_velocity, _object_velocity_noise),
+)

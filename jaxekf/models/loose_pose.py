@@ -1,0 +1,150 @@
+"""`loose_pose`: the state of `tight`, fed by the tracker's pose of the whole tool.
+
+What Tobergte, Pomarlan, Hirzinger (2009) compare with, and the model for trackers that give a pose (NDI
+tools, motion capture). Where a recording holds single markers only, their raw pose is taken.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, pose, rotation
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.models import inertial, sources
+from jaxekf.recording import Optical, Recording, Samples
+
+GATE = 0.999
+
+
+class Pose(NamedTuple):
+    """Pose of the tracked tool in the reference frame."""
+
+    position: Any
+    q_ref_body: Any
+
+
+class Noise(NamedTuple):
+    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+
+    gyroscope: Any
+    accelerometer: Any
+    bias_walk: Any
+    """Random walk of the gyroscope's bias."""
+    accelerometer_walk: Any
+    position: Any
+    """The tracker's position, standard deviation of a sample, reference frame; a reported fit error
+    adds to it."""
+    optical: Any
+    """The tracker's attitude, standard deviation of a sample, body frame."""
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run; fields as in `inertial.Setup`."""
+
+    gravity_ref: Any
+    p_body_object: Any
+    q_body_object: Any
+    p_body_tool: Any
+    """(3,) metres: the point whose position the tracker gives."""
+
+
+def predict_pose(x: inertial.State, u: Any, params: Parameters, aux: Any) -> Pose:
+    """Where the tracked point is, and the tool's attitude."""
+    point = params.setup.p_body_tool + params.calibration.lever_arm
+    turn = rotation.exp(params.calibration.alignment)
+    return Pose(
+        x.position + rotation.rotate(x.q_ref_body, point), rotation.product(x.q_ref_body, turn)
+    )
+
+
+def pose_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (6, 6) of a pose; `aux` is its reported error in metres."""
+    position = linalg.covariance(params.noise.position, 3) + aux * aux * jnp.eye(3)
+    return inertial.block_diagonal([position, linalg.covariance(params.noise.optical, 3)])
+
+
+def raw_pose(recording: Recording) -> Optical:
+    """The tracker's pose, or that of the markers where there are only those."""
+    if recording.optical is None and recording.markers is not None:
+        return pose.from_markers(recording.markers)
+    return recording.need_optical()
+
+
+def _source(recording: Recording) -> Samples:
+    optical = raw_pose(recording)
+    position = sources.tracked_position(optical, recording)
+    seen = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
+    value = Pose(np.where(seen[:, None], position, 0.0), optical.q_ref_body)
+    error = np.zeros(len(seen)) if optical.error is None else np.nan_to_num(optical.error)
+    return Samples(optical.time_ns - optical.latency_ns, value, seen, error, optical.latency_ns)
+
+
+def _setup(recording: Recording) -> Setup:
+    return Setup(*inertial.setup(recording, raw_pose(recording)), _tracked_point(recording))
+
+
+def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
+    """The first visible pose."""
+    seen = samples["optical"]
+    valid = np.asarray(seen.mask.all(axis=1))
+    if not valid.any():
+        return None
+    first = int(np.argmax(valid))
+    arm = _tracked_point(recording)
+    origin = seen.value.position - sources.turned(seen.value.q_ref_body, arm)
+    known = {
+        "position": origin[first],
+        "q_ref_body": seen.value.q_ref_body[first],
+        "velocity": pose.velocity_at(seen.time_ns, origin, valid, first),
+    }
+    return Start(int(seen.time_ns[first]), known)
+
+
+def _tracked_point(recording: Recording) -> Any:
+    said = raw_pose(recording).p_body_tool
+    return np.zeros(3) if said is None else np.asarray(said, float)
+
+
+DEFAULTS = Parameters(
+    Noise(
+        gyroscope=np.deg2rad(0.05),
+        accelerometer=1.85e-3 * 9.80665,
+        bias_walk=np.deg2rad(0.002),
+        accelerometer_walk=1e-3,
+        position=0.5e-3,
+        optical=np.deg2rad(0.2),
+    ),
+    inertial.CALIBRATION,
+    inertial.INITIAL,
+    Setup(*inertial.SETUP, np.zeros(3)),
+)
+
+UNITS = Parameters(
+    Noise("rad/s/sqrt(Hz)", "m/s^2/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)", "m", "rad"),
+    inertial.CALIBRATION_UNITS,
+    inertial.INITIAL_UNITS,
+)
+
+SPACE: Any = Pose(Euclidean(3, "m", frame="reference"), SO3())
+
+MODEL = Model(
+    name="loose_pose",
+    summary="pose, velocity and IMU biases from the tracker's pose and an IMU",
+    space=inertial.SPACE,
+    transition=inertial.transition,
+    process_noise=inertial.process_noise,
+    sensors=(Sensor("optical", SPACE, predict_pose, pose_noise, _source, gate=GATE, aux_like=0.0),),
+    parameters=DEFAULTS,
+    units=UNITS,
+    noise_dims=Noise(3, 3, 3, 3, 3, 3),
+    initial_mean=inertial.initial_mean,
+    initial_covariance=inertial.initial_covariance,
+    find_start=find_start,
+    setup=_setup,
+    input=Input("imu", sources.imu, inertial.clock_offset),
+    outputs=inertial.OUTPUTS,
+)

@@ -1,0 +1,189 @@
+"""`tight`: every visible marker by itself, at the time it was seen, with the IMU as input.
+
+The tightly coupled filter of Tobergte, Pomarlan, Hirzinger (2009), eqs. 16 to 23: with two markers, one,
+or for a while none, the pose is still known. The model has one sensor of three rows for each marker; see
+`jaxekf.models.inertial` for the state.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, pose, rotation
+from jaxekf.manifold import Euclidean
+from jaxekf.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.models import inertial, sources
+from jaxekf.recording import NANOSECONDS, Recording, Samples
+
+GATE = 0.999
+
+
+class Noise(NamedTuple):
+    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+
+    gyroscope: Any
+    accelerometer: Any
+    bias_walk: Any
+    """Random walk of the gyroscope's bias."""
+    accelerometer_walk: Any
+    marker: Any
+    """A marker's position, standard deviation of a sample, reference frame; a reported fit error adds
+    to it."""
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run; fields as in `inertial.Setup`."""
+
+    gravity_ref: Any
+    p_body_object: Any
+    q_body_object: Any
+    p_body_marker: Any
+    """(M, 3) metres: the markers, in the order of the model's sensors."""
+
+
+def arm(index: int, params: Parameters) -> Array:
+    """Where a marker is in the body (3,), metres."""
+    said = params.setup.p_body_marker[index]
+    turned = rotation.rotate(rotation.exp(params.calibration.alignment), said)
+    return params.calibration.lever_arm + turned
+
+
+def _predict(index: int, x: inertial.State, u: Any, params: Parameters, aux: Any) -> Array:
+    """Eq. 23: the body's origin and the marker's arm turned into the reference frame."""
+    return x.position + rotation.rotate(x.q_ref_body, arm(index, params))
+
+
+def marker_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of a marker's sample, m^2, reference frame; `aux` is its reported error."""
+    return linalg.covariance(params.noise.marker, 3) + aux * aux * jnp.eye(3)
+
+
+def sensor_name(marker: str) -> str:
+    """Name of a marker's sensor."""
+    return f"marker_{marker}"
+
+
+def _source(name: str, recording: Recording) -> Samples:
+    """A marker's positions (N, 3); masked everywhere where the recording does not have the marker."""
+    markers = recording.need_markers()
+    count = len(markers.time_ns)
+    taken = markers.time_ns - markers.latency_ns
+    if name not in markers.names:
+        never = np.zeros(count, bool)
+        return Samples(taken, np.zeros((count, 3)), never, np.zeros(count), markers.latency_ns)
+    at = markers.names.index(name)
+    usable = markers.usable[:, at]
+    error = np.zeros(count) if markers.error is None else np.nan_to_num(markers.error[:, at])
+    position = np.where(usable[:, None], markers.position[:, at], 0.0)
+    return Samples(taken, position, usable, error, markers.latency_ns)
+
+
+def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
+    markers = recording.need_markers()
+    places = dict(zip(markers.names, markers.p_body_marker, strict=True))
+    # A marker that this recording does not have is never seen: any place will do.
+    arms = np.array([places.get(name, np.zeros(3)) for name in names], float)
+    return Setup(*inertial.setup(recording, pose.from_markers(markers)), arms)
+
+
+def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
+    """The first frame in which three markers, not on a line, give a pose; what came before is dropped."""
+    times = next(iter(samples.values())).time_ns
+    raw = pose.from_markers(recording.need_markers())
+    inside = np.isin(raw.time_ns - raw.latency_ns, times)
+    valid = raw.valid & inside
+    if not valid.any() or raw.position is None:
+        return None
+    first = int(np.argmax(valid))
+    taken = raw.time_ns - raw.latency_ns
+    waited = (taken[first] - times[0]) / NANOSECONDS
+    note = ""
+    if waited > 0.0:
+        note = (
+            f"waited {waited:.3f} s for a frame with three markers, not on a line, to start from;"
+            f" {int((taken[inside] < taken[first]).sum())} frames before it are not used"
+        )
+    known = {
+        "position": raw.position[first],
+        "q_ref_body": raw.q_ref_body[first],
+        "velocity": pose.velocity_at(taken, raw.position, valid, first),
+    }
+    return Start(int(taken[first]), known, note)
+
+
+def adapt(recordings: Sequence[Recording]) -> Model:
+    """The model with a sensor for every marker of these recordings."""
+    names: dict[str, None] = {}
+    for recording in recordings:
+        names |= dict.fromkeys(recording.need_markers().names)
+    return for_markers(tuple(names)) if names else MODEL
+
+
+@lru_cache(maxsize=32)
+def for_markers(names: tuple[str, ...]) -> Model:
+    """The model for markers of these names; the same object for the same names."""
+    params = DEFAULTS
+    if len(names) != len(L_SHAPE):
+        places = np.zeros((len(names), 3))
+        places[: len(L_SHAPE)] = L_SHAPE[: len(names)]
+        params = DEFAULTS._replace(setup=DEFAULTS.setup._replace(p_body_marker=places))
+    return _build(names, params)
+
+
+def _sensor(index: int, name: str) -> Sensor:
+    predict: Callable[..., Any] = partial(_predict, index)
+    source = partial(_source, name)
+    space = Euclidean(3, "m", frame="reference")
+    return Sensor(sensor_name(name), space, predict, marker_noise, source, gate=GATE, aux_like=0.0)
+
+
+L_SHAPE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+"""The tool of the paper: markers on an L with legs of 10 cm, the IMU at its corner."""
+
+DEFAULTS = Parameters(
+    Noise(
+        gyroscope=np.deg2rad(0.05),
+        accelerometer=1.85e-3 * 9.80665,
+        bias_walk=np.deg2rad(0.002),
+        accelerometer_walk=1e-3,
+        marker=0.25e-3,
+    ),
+    inertial.CALIBRATION,
+    inertial.INITIAL,
+    Setup(*inertial.SETUP, L_SHAPE),
+)
+
+UNITS = Parameters(
+    Noise("rad/s/sqrt(Hz)", "m/s^2/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)", "m"),
+    inertial.CALIBRATION_UNITS,
+    inertial.INITIAL_UNITS,
+)
+
+
+def _build(names: tuple[str, ...], params: Parameters) -> Model:
+    return Model(
+        name="tight",
+        summary="pose, velocity and IMU biases from single markers and an IMU",
+        space=inertial.SPACE,
+        transition=inertial.transition,
+        process_noise=inertial.process_noise,
+        sensors=tuple(_sensor(i, name) for i, name in enumerate(names)),
+        parameters=params,
+        units=UNITS,
+        noise_dims=Noise(3, 3, 3, 3, 3),
+        initial_mean=inertial.initial_mean,
+        initial_covariance=inertial.initial_covariance,
+        find_start=find_start,
+        adapt=adapt,
+        setup=partial(_setup, names),
+        input=Input("imu", sources.imu, inertial.clock_offset),
+        outputs=inertial.OUTPUTS,
+    )
+
+
+MODEL = for_markers(("1", "2", "3"))
+"""For three markers; `adapt` makes the one that a recording needs."""

@@ -1,7 +1,7 @@
 """CSV files as columns of numbers and exact times, with every fault named by its place."""
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Floats, Times
 
+QUATERNION: tuple[str, ...] = ("qw", "qx", "qy", "qz")
+POSITION: tuple[str, ...] = ("x", "y", "z")
+
 
 class Table(NamedTuple):
     """A CSV file as text, its rows with the number of their line."""
@@ -20,6 +23,18 @@ class Table(NamedTuple):
     columns: tuple[str, ...]
     rows: list[list[str]]
     lines: list[int]
+
+
+class Sheet(NamedTuple):
+    """What a CSV file is written from."""
+
+    columns: Sequence[str]
+    """Names of all columns after ``time``."""
+    time_ns: Times
+    values: Floats
+    """(N, columns), without the column of words; NaN is written as a blank cell."""
+    words: Sequence[str] | None = None
+    """(N,) texts of the first column after ``time``, where that is not a number."""
 
 
 def read_table(path: Path) -> Table:
@@ -60,20 +75,24 @@ def read_table(path: Path) -> Table:
     return Table(path, columns, rows[1:], lines[1:])
 
 
-def need_columns(table: Table, allowed: Iterable[Sequence[str]], optional: Sequence[str]) -> None:
-    """The columns are one of the allowed sets plus any of the optional ones."""
-    choices = list(allowed)
-    for choice in choices:
-        extra = set(table.columns) - set(choice)
-        if set(choice) <= set(table.columns) and extra <= set(optional):
+def need_columns(table: Table, *layouts: str) -> None:
+    """The columns are those of a layout as it is documented, such as ``time,angle[,scored]``.
+
+    What stands in one pair of brackets is there whole or not at all; the order is free.
+    """
+    for layout in layouts:
+        required, *optional = (part.split(",") for part in layout.replace("]", "").split("[,"))
+        left = set(table.columns) - set(required)
+        for group in optional:
+            if left >= set(group):
+                left -= set(group)
+        if set(required) <= set(table.columns) and not left:
             return
-    wanted = " or ".join(",".join(choice) for choice in choices)
-    more = f" (and any of {','.join(optional)})" if optional else ""
     raise RecordingError(
         table.path,
         f"columns {','.join(table.columns)}",
-        f"{wanted}{more}",
-        "renaming or adding columns",
+        " or ".join(layouts),
+        "renaming, adding or removing columns",
         line=1,
     )
 
@@ -115,6 +134,44 @@ def finite_numbers(table: Table, names: tuple[str, ...]) -> Floats:
     return values
 
 
+def whole_or_blank(table: Table, names: Sequence[str]) -> Floats:
+    """Columns (N, len(names)): in each row finite numbers, or NaN where all of its cells are blank."""
+    values = numbers(table, names, blank=True)
+    blank = np.isnan(values)
+    bad = np.flatnonzero((blank.any(axis=1) & ~blank.all(axis=1)) | np.isinf(values).any(axis=1))
+    if bad.size:
+        row = int(bad[0])
+        cells = [table.rows[row][table.columns.index(name)].strip() for name in names]
+        raise RecordingError(
+            table.path,
+            f"'{','.join(cells)}'",
+            f"{len(names)} finite numbers, or {len(names)} blank cells for what is not known",
+            "completing or blanking them",
+            line=table.lines[row],
+            column=",".join(names),
+        )
+    return values
+
+
+def reported(table: Table, name: str, least: float = -np.inf) -> Floats | None:
+    """A column (N,) of finite numbers not below `least`, NaN where blank; None without the column."""
+    if name not in table.columns:
+        return None
+    values = numbers(table, (name,), blank=True)[:, 0]
+    bad = np.flatnonzero(np.isinf(values) | (values < least))
+    if bad.size:
+        row = int(bad[0])
+        raise RecordingError(
+            table.path,
+            f"{values[row]}",
+            "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more",
+            "blanking the cell, which means that none was reported",
+            line=table.lines[row],
+            column=name,
+        )
+    return values
+
+
 def parse_seconds(text: str) -> int:
     """Decimal seconds to nanoseconds, exactly; digits beyond the ninth are rounded."""
     whole, _, part = text.partition(".")
@@ -123,7 +180,8 @@ def parse_seconds(text: str) -> int:
     return int((Decimal(text) * NANOSECONDS).to_integral_value())
 
 
-def read_times(table: Table) -> Times:
+def read_times(table: Table, *, repeated: bool = False) -> Times:
+    """The column ``time`` (N,), which increases; with `repeated`, rows that follow may share a time."""
     at = table.columns.index("time")
     times = np.empty(len(table.rows), np.int64)
     for i, row in enumerate(table.rows):
@@ -139,14 +197,15 @@ def read_times(table: Table) -> Times:
                 line=table.lines[i],
                 column="time",
             ) from None
-    backwards = np.flatnonzero(np.diff(times) <= 0)
+    step = np.diff(times)
+    backwards = np.flatnonzero(step < 0 if repeated else step <= 0)
     if backwards.size:
         i = int(backwards[0]) + 1
         raise RecordingError(
             table.path,
             f"{table.rows[i][at].strip()} after {table.rows[i - 1][at].strip()}",
-            "times that increase",
-            "sorting the rows and removing duplicates",
+            "times that do not decrease" if repeated else "times that increase",
+            "sorting the rows" if repeated else "sorting the rows and removing duplicates",
             line=table.lines[i],
             column="time",
         )
@@ -171,9 +230,15 @@ def write_csv(
     path: Path, columns: Sequence[str], time_ns: Times, values: Floats, digits: int
 ) -> None:
     """A CSV file of a time column and numbers; NaN is written as a blank cell."""
+    write_sheet(path, Sheet(columns, time_ns, values), digits)
+
+
+def write_sheet(path: Path, sheet: Sheet, digits: int) -> None:
+    """A CSV file of a time column, maybe one of words, and numbers with so many digits."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time", *columns])
-        for time, row in zip(time_ns, values, strict=True):
+        writer.writerow(["time", *sheet.columns])
+        for i, (time, row) in enumerate(zip(sheet.time_ns, sheet.values, strict=True)):
             cells = ["" if np.isnan(v) else f"{v:.{digits}g}" for v in row]
-            writer.writerow([format_seconds(int(time)), *cells])
+            words = () if sheet.words is None else (sheet.words[i],)
+            writer.writerow([format_seconds(int(time)), *words, *cells])

@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     ("errors",),
     ("rotation", "linalg", "recording", "files"),
-    ("manifold", "tables", "truth"),
-    ("model", "pose"),
+    ("manifold", "tables", "truth", "description"),
+    ("model", "pose", "marker_storage", "encoder_storage"),
     ("timeline",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks"),

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxekf
-from jaxekf import files, simulate, storage, tables
+from jaxekf import encoder_storage, files, simulate, storage, tables
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Encoder, Imu, Optical, Recording
 
@@ -85,7 +85,7 @@ def test_encoder_frames_and_sides(tmp_path):
             "q_optical_encoder": np.roll(frame.as_quat(), 1).tolist(),
         }
         table = tables.Table(tmp_path, ("time", "angle"), [["0", "0.7"]], [2])
-        return Rotation.from_quat(np.roll(storage._encoder(table, about).q_ref_body[0], -1))
+        return Rotation.from_quat(np.roll(encoder_storage.read(table, about).q_ref_body[0], -1))
 
     for side, expected in (("reference", frame * turn * zero), ("body", frame * zero * turn)):
         assert (read(side).inv() * expected).magnitude() < 1e-12

@@ -199,7 +199,8 @@ def _gates(
             late = jnp.maximum(refused_s, samples[name].dt)
             refused_s = jnp.where(finite[name][row], late, refused_s)
     refused = jnp.where(let_in, 0.0, ahead.refused + refused_s)
-    recovered = kept_out & (refused > system.model.patience_s)
+    # Earlier samples must have used up the patience: a single one is refused whatever its period.
+    recovered = kept_out & ~let_in & (ahead.refused > system.model.patience_s)
     gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
     widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
     return _Gates(gated, jnp.where(recovered, 0.0, refused), recovered, widened)

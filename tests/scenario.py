@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxekf import ekf, jit
 from jaxekf.model import Parameters
-from jaxekf.models import loose, loose_additive, loose_rate
+from jaxekf.models import loose, loose_additive, loose_rate, tight
 from jaxekf.recording import Imu, Markers, Optical, Recording, from_scipy
 from jaxekf.timeline import Knots, Rows, Steps
 
-ARMS = np.array([[0.02, 0.0, 0.01], [0.1, 0.01, 0.0], [0.0, 0.09, -0.02]])
+ARMS = tight.L_SHAPE
 BIAS = np.array([0.02, -0.015, 0.01])
 
 
@@ -227,7 +227,7 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
     still = Motion(np.zeros(3), np.zeros(3), np.zeros(3))
     motion = still if rest else smooth_motion(seed)
     scale = 0.0 if rest else 1.0
-    q = motion.attitude(1e-9 * optical_ns)
+    q = exact = motion.attitude(1e-9 * optical_ns)
     if not rest:
         q = noisy_attitude(rng, q, 0.005)
     t = 1e-9 * imu_ns
@@ -240,11 +240,12 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
         q = from_scipy(rotation * Rotation.from_quat(np.roll(q, -1, axis=1)))
         gyroscope = rotation.apply(gyroscope) if turn_rate else gyroscope
         gravity = rotation.apply(gravity)
+        exact = from_scipy(rotation * rotation_of(exact))
     valid = np.ones(len(q), bool)
     valid[1 + seed % 5] = False
     optical = Optical(start_ns + optical_ns, q, valid, np.zeros((len(q), 3)))
     blur = scale * 2e-4 * rng.standard_normal((len(q), 3, 3))
-    seen = np.stack([rotation_of(q).apply(arm) for arm in ARMS], axis=1) + blur
+    seen = np.stack([rotation_of(exact).apply(arm) for arm in ARMS], axis=1) + blur
     visible = valid[:, None] & np.ones((1, 3), bool)
     visible[1 + (seed + 2) % 5, 1] = False
     markers = Markers(start_ns + optical_ns, seen, visible, ("1", "2", "3"), ARMS)

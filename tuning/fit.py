@@ -159,6 +159,12 @@ def tune(
     return Tuned(chosen, params, base, aim, best, tuple(history), stopped, scale, where, origin)
 
 
+def on_host(free: Array) -> Any:
+    """The vector without its place: a gradient comes back shared among the devices, and a point found
+    from it would be another argument to compile for."""
+    return np.asarray(free)
+
+
 def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Array]:
     """What each term of the objective is the mean over, of all groups together."""
     found = [count(data, tuple(weights_of(objective))) for data in groups]
@@ -203,24 +209,23 @@ class _Search:
         return total_counts(self.validation or (), self.objective)
 
     def value_and_gradient(self, free: Array) -> tuple[float, Array]:
-        counts = self.training_counts
+        counts, plain = self.training_counts, on_host(free)
         found = [
             _value_and_gradient(
-                self.model, self.objective, self.layout, free, self.base, data, counts
+                self.model, self.objective, self.layout, plain, self.base, data, counts
             )
             for data in self.training
         ]
-        return float(sum(value for value, _ in found)), sum(
-            (gradient for _, gradient in found), jnp.zeros_like(free)
-        )
+        gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(free.shape))
+        return float(sum(value for value, _ in found)), jnp.asarray(gradient)
 
     def validation_value(self, free: Array) -> float:
         if self.validation is None:
             return float("nan")
-        counts = self.validation_counts
+        counts, plain = self.validation_counts, on_host(free)
         return float(
             sum(
-                _value(self.model, self.objective, self.layout, free, self.base, data, counts)
+                _value(self.model, self.objective, self.layout, plain, self.base, data, counts)
                 for data in self.validation
             )
         )

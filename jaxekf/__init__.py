@@ -19,13 +19,15 @@ from jaxekf.interpolation import InputSample
 from jaxekf.kernels import jit
 from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
 from jaxekf.metrics import Score, score
-from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor
+from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor, Start
 from jaxekf.models import get_model
+from jaxekf.online import estimate_online
 from jaxekf.parameters import load as load_parameters
 from jaxekf.parameters import save as save_parameters
-from jaxekf.recording import Encoder, Imu, Optical, Recording, Samples
+from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, Samples
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.storage import load, save
+from jaxekf.stream import Known, Stream
 
 __version__ = "0.1.0"
 
@@ -42,7 +44,9 @@ __all__ = [
     "Input",
     "InputSample",
     "JaxekfError",
+    "Known",
     "Manifold",
+    "Markers",
     "Model",
     "ModelError",
     "Optical",
@@ -56,10 +60,13 @@ __all__ = [
     "Score",
     "Sensor",
     "SensorRecord",
+    "Start",
+    "Stream",
     "TuningError",
     "demo",
     "estimate",
     "estimate_many",
+    "estimate_online",
     "get_model",
     "initial_belief",
     "jit",

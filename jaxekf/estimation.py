@@ -222,6 +222,13 @@ def _collect(
         out = model.output(name)
         unit = manifold.error_units(out.space)[0]
         named[name] = OutputEstimate(flat(value), flat(cov), out.frame, unit)
+    notes = line.notes
+    if output.instants.recovered is not None and (opened := flat(output.instants.recovered)).any():
+        at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
+        notes += (
+            f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
+            f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times",
+        )
     total = float(flat(output.instants.log_likelihood).sum())
     return Estimate(
         run=recording.name,
@@ -234,7 +241,7 @@ def _collect(
         log_likelihood=total,
         account=account,
         params=params._replace(setup=line.setup),
-        notes=line.notes,
+        notes=notes,
         provenance=provenance() | {"recording": str(recording.path or recording.name)},
     )
 

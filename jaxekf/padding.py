@@ -87,10 +87,12 @@ def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> S
 
 
 def _pad_knots(knots: Knots | None, count: int) -> Knots | None:
-    """Knots up to `count`, held at the last value for a second each: never reached by a real step."""
+    """Knots up to `count` that hold the last value, as far apart as the last two: what is read at the
+    last one, its noise bandwidth included, does not change."""
     if knots is None or len(knots.time) >= count:
         return knots
-    more = np.arange(1.0, count - len(knots.time) + 1.0)
+    apart = knots.time[-1] - knots.time[-2] if len(knots.time) > 1 else 1.0
+    more = apart * np.arange(1.0, count - len(knots.time) + 1.0)
     value = np.repeat(knots.value[-1:], len(more), axis=0)
     return Knots(
         np.concatenate([knots.time, knots.time[-1] + more]),

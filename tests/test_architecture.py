@@ -33,7 +33,7 @@ ORDER = [
     ("parameters",),
     ("result",),
     ("estimation",),
-    ("metrics", "simulate", "online"),
+    ("metrics", "simulate", "online", "stream"),
     ("simulate_tool",),
     ("datasets.columns",),
     ("datasets", "datasets.asl", "datasets.broad", "datasets.demo"),

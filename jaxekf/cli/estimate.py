@@ -60,6 +60,8 @@ def warn(made: Estimate) -> None:
                 f"{made.run}: {count['dropped_outside_run']} of {count['read']} samples of {name} lie"
                 " outside the run and were dropped"
             )
+    for text in made.notes:
+        note(f"{made.run}: {text}")
     for name, record in made.sensors.items():
         if len(record.nis) and made.mean_nis(name) > _SUSPICIOUS_NIS:
             note(
@@ -117,13 +119,15 @@ def estimate(
 def _row(summary: dict[str, Any]) -> list[Any]:
     judged = summary.get("score", {})
     nan = float("nan")
-    account = summary["account"].get("optical", {})
+    trackers = [n for n in summary["account"] if n == "optical" or n.startswith("marker_")]
+    used, read = (sum(summary["account"][n].get(k, 0) for n in trackers) for k in ("used", "read"))
+    known = [v for v in (summary["mean_nis"].get(n) for n in trackers) if v is not None]
     return [
         summary["run"],
         summary["duration_s"],
         judged.get("attitude_rmse_deg", nan),
         judged.get("rate_rmse_deg_s", nan),
         judged.get("attitude_nees", nan),
-        summary["mean_nis"].get("optical") or nan,
-        f"{account.get('used', 0)} of {account.get('read', 0)}",
+        sum(known) / len(known) if known else nan,
+        f"{used} of {read}",
     ]

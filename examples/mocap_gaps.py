@@ -1,0 +1,271 @@
+"""Real motion capture with stretches hidden, carried on through them by the real IMU.
+
+    python examples/mocap_gaps.py DIR [--rooms 1 3 4] [--hide 0.5 1 2]
+
+DIR holds TUM-VI rooms or EuRoC folders with a pose stream. From each recording stretches of poses are
+hidden; at the end of each the estimate is compared with the pose that was hidden there, beside holding the
+last pose and going on with its velocity. Real outliers of the motion capture stay in. The last line is
+JSON: medians over all hidden stretches, by length; the exit status is 1 where a figure is missed.
+"""
+
+import argparse
+import json
+import os
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+from rich.progress import Progress  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+import jaxekf  # noqa: E402
+from jaxekf.datasets import asl  # noqa: E402
+from jaxekf.models import loose_pose  # noqa: E402
+from jaxekf.parameters import as_arrays  # noqa: E402
+from jaxekf.recording import Flags, Floats, Times, to_scipy  # noqa: E402
+
+SETTLE_S, BETWEEN_S, FIT_S = 8.0, 3.0, 0.05
+STEP_DEG, STEP_M = 1.0, 0.05
+"""A step from one frame to the next that differs by more from the gyroscope's, or is longer, is an
+outlier."""
+METHODS = ("estimate", "hold last", "constant velocity")
+
+
+class Gap(NamedTuple):
+    """A hidden stretch: its last visible frame and the hidden frame at its end."""
+
+    before: int
+    end: int
+
+
+class Case(NamedTuple):
+    """One recording with one length of stretches hidden."""
+
+    name: str
+    length_s: float
+    gaps: list[Gap]
+    original: jaxekf.Recording
+    hidden: jaxekf.Recording
+
+
+def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
+    """Noise of a small MEMS IMU and of motion capture, the same for all; no number is tuned to a room.
+
+    Densities are several times a data sheet's: scale, alignment and timing are not calibrated here.
+    """
+    params = loose_pose.MODEL.parameters
+    noise = params.noise._replace(
+        gyroscope=6e-4,
+        accelerometer=1e-2,
+        bias_walk=5e-5,
+        accelerometer_walk=1e-3,
+        position=1e-3,
+        optical=np.deg2rad(0.2),
+    )
+    return as_arrays(params._replace(noise=noise))
+
+
+def turning_off(recording: jaxekf.Recording) -> Floats:
+    """Degrees by which each step of the poses differs from the gyroscope's, (N - 1,)."""
+    optical, imu = recording.need_optical(), recording.need_imu()
+    taken = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / 1e9
+    middle, span = 0.5 * (taken[1:] + taken[:-1]), np.diff(taken)
+    known = (imu.time_ns - imu.time_ns[0]) / 1e9
+    rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
+    turn = to_scipy(optical.q_ref_body)
+    expected = Rotation.from_rotvec(rate * span[:, None])
+    return np.rad2deg((expected.inv() * turn[:-1].inv() * turn[1:]).magnitude())
+
+
+def good_frames(recording: jaxekf.Recording) -> Flags:
+    """Frames that agree with both neighbours: where the motion capture can be believed."""
+    optical = recording.need_optical()
+    assert optical.position is not None
+    step_m = np.linalg.norm(np.diff(optical.position, axis=0), axis=1)
+    calm = (turning_off(recording) < STEP_DEG) & (step_m < STEP_M)
+    good = optical.valid.copy()
+    good[1:] &= calm
+    good[:-1] &= calm
+    return good
+
+
+def hide(recording: jaxekf.Recording, length_s: float) -> Case:
+    """Stretches of the length hidden one after the other, with time between them to settle."""
+    optical = recording.need_optical()
+    good = good_frames(recording)
+    t = optical.time_ns / 1e9
+    valid, gaps = optical.valid.copy(), []
+    start = t[0] + SETTLE_S
+    while start + length_s < t[-1] - 0.5:
+        inside = np.flatnonzero((t >= start) & (t <= start + length_s))
+        before = int(inside[0]) - 1 if inside.size else 0
+        whole = inside.size and good[inside[-1]] and good[before - 6 : before + 1].all()
+        if whole and abs(t[inside[-1]] - t[before] - length_s) < 0.05:
+            valid[inside] = False
+            gaps.append(Gap(before, int(inside[-1])))
+        start += length_s + BETWEEN_S
+    changed = recording.replace(
+        name=f"{recording.name}-{length_s:g}", optical=replace(optical, valid=valid)
+    )
+    return Case(recording.name, length_s, gaps, recording, changed)
+
+
+def predictions(case: Case, made: jaxekf.Estimate, gap: Gap) -> dict[str, tuple[Floats, Rotation]]:
+    """Position of the tracked point and attitude at the end of a stretch, by each method."""
+    optical = case.original.need_optical()
+    assert optical.position is not None
+    at = int(np.searchsorted(made.time_ns, optical.time_ns[gap.end] - optical.latency_ns))
+    turn = to_scipy(made.attitude.value[at])
+    point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
+    found = {"estimate": (made.outputs["position"].value[at] + turn.apply(point), turn)}
+    last = optical.position[gap.before], to_scipy(optical.q_ref_body[gap.before])
+    found["hold last"] = last
+    t = (optical.time_ns - optical.time_ns[gap.before]) / 1e9
+    chosen = np.flatnonzero((t >= -FIT_S) & (t <= 0.0) & optical.valid)
+    speed = np.polyfit(t[chosen], optical.position[chosen], 1)[0]
+    vectors = (last[1].inv() * to_scipy(optical.q_ref_body[chosen])).as_rotvec()
+    rate = np.polyfit(t[chosen], vectors, 1)[0]
+    span = t[gap.end]
+    found["constant velocity"] = (
+        last[0] + speed * span,
+        last[1] * Rotation.from_rotvec(rate * span),
+    )
+    return found
+
+
+def score(case: Case, made: jaxekf.Estimate) -> dict[str, list[tuple[float, float]]]:
+    """Position (mm) and attitude (deg) errors of each method, one for each stretch."""
+    optical = case.original.need_optical()
+    assert optical.position is not None
+    errors: dict[str, list[tuple[float, float]]] = {name: [] for name in METHODS}
+    for gap in case.gaps:
+        true = to_scipy(optical.q_ref_body[gap.end])
+        for name, (position, turn) in predictions(case, made, gap).items():
+            off = 1e3 * float(np.linalg.norm(position - optical.position[gap.end]))
+            errors[name].append((off, float(np.rad2deg((turn.inv() * true).magnitude()))))
+    return errors
+
+
+def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, Any]:
+    """What became of the motion capture's own outliers, where nothing was hidden."""
+    optical = recording.need_optical()
+    assert optical.position is not None
+    good = good_frames(recording)
+    at = _nearest(made.time_ns, optical.time_ns - optical.latency_ns)
+    inside = (optical.time_ns >= made.time_ns[0] + int(1e9)) & (optical.time_ns <= made.time_ns[-1])
+    turn = to_scipy(made.attitude.value[at])
+    point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
+    off = made.outputs["position"].value[at] + turn.apply(point) - optical.position
+    angle = np.rad2deg((turn.inv() * to_scipy(optical.q_ref_body)).magnitude())
+    judged = good & inside
+    record = made.sensors["optical"]
+    return {
+        "outlier_steps": int((turning_off(recording) > STEP_DEG).sum()),
+        "refused": int(record.gated.any(axis=1).sum()),
+        "frames": len(record.time_ns),
+        "median_deg": float(np.median(angle[judged])),
+        "largest_deg_1_in_1000": float(np.quantile(angle[judged], 0.999)),
+        "largest_mm_1_in_1000": 1e3
+        * float(np.quantile(np.linalg.norm(off[judged], axis=1), 0.999)),
+        "largest_deg_at_the_end": float(angle[np.flatnonzero(judged)[-100:]].max()),
+    }
+
+
+def _nearest(times: Times, asked: Times) -> Any:
+    return np.clip(np.searchsorted(times, asked), 0, len(times) - 1)
+
+
+def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Recording]:
+    """The recordings of a folder, only the rooms named where there are any."""
+    found = asl.find(folder)
+    if rooms:
+        wanted = {int(room) for room in rooms}
+        found = [
+            p
+            for p in found
+            if (m := re.search(r"room_?(\d+)", str(p.name))) and int(m[1]) in wanted
+        ]
+    if not found:
+        sys.exit(
+            f"{folder}: got no recording in the ASL layout, expected TUM-VI rooms or EuRoC folders"
+        )
+    return [asl.load(path) for path in found]
+
+
+def medians(errors: list[tuple[float, float]]) -> dict[str, float]:
+    """Median position and attitude error."""
+    position, attitude = np.median(np.array(errors), axis=0)
+    return {"mm": float(position), "deg": float(attitude)}
+
+
+def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool]:
+    """Each figure that must hold."""
+    checks = {}
+    if "1" in table:
+        one = table["1"]
+        checks["attitude after 1 s: at most 0.5 deg"] = one["estimate"]["deg"] <= 0.5
+        checks["attitude after 1 s: at most 0.1 of holding the last"] = (
+            one["estimate"]["deg"] <= 0.1 * one["hold last"]["deg"]
+        )
+    if "0.5" in table:
+        half = table["0.5"]
+        checks["position after 0.5 s: at most 0.2 of constant velocity"] = (
+            half["estimate"]["mm"] <= 0.2 * half["constant velocity"]["mm"]
+        )
+    for name, found in outlying.items():
+        checks[f"{name}: outliers do not make it diverge"] = (
+            found["largest_deg_1_in_1000"] < 5.0 and found["largest_deg_at_the_end"] < 2.0
+        )
+    return checks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--rooms", nargs="+", metavar="N", help="numbers of TUM-VI rooms")
+    parser.add_argument("--hide", nargs="+", type=float, default=[0.5, 1.0, 2.0], metavar="SECONDS")
+    arguments = parser.parse_args()
+    recordings = chosen_recordings(arguments.folder, arguments.rooms)
+    table: dict[str, dict[str, list[Any]]] = {}
+    outlying = {}
+    with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task("recordings", total=len(recordings))
+        for recording in recordings:
+            params = parameters_of(recording)
+            cases = [hide(recording, length) for length in arguments.hide]
+            runs = [recording, *(case.hidden for case in cases)]
+            whole, *found = jaxekf.estimate_many(runs, "loose_pose", params)
+            outlying[recording.name] = outliers(recording, whole)
+            for case, made in zip(cases, found, strict=True):
+                by_method = table.setdefault(f"{case.length_s:g}", {name: [] for name in METHODS})
+                for name, errors in score(case, made).items():
+                    by_method[name] += errors
+            progress.advance(task)
+    summary: dict[str, Any] = {}
+    for length, methods in table.items():
+        if methods["estimate"]:
+            summary[length] = {name: medians(errors) for name, errors in methods.items()}
+            summary[length]["stretches"] = len(methods["estimate"])
+    print(f"{'hidden':>8}{'stretches':>11}  " + "".join(f"{name:>28}" for name in METHODS))
+    for length, row in summary.items():
+        cells = "".join(f"{row[n]['mm']:>16.1f} mm{row[n]['deg']:>6.2f}°  " for n in METHODS)
+        print(f"{length + ' s':>8}{row['stretches']:>11}  {cells}")
+    for name, found in outlying.items():
+        print(f"{name}: {found}")
+    checks = checks_of(summary, outlying)
+    for text, passed in checks.items():
+        print(f"{'ok    ' if passed else 'MISSED'} {text}")
+    print(json.dumps({"median": summary, "outliers": outlying, "checks": checks}))
+    sys.exit(0 if all(checks.values()) else 1)
+
+
+if __name__ == "__main__":
+    main()

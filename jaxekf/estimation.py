@@ -1,6 +1,6 @@
 """From recorded runs to estimates: the host's side of the filter."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -217,11 +217,6 @@ def _collect(
     for count in account.values():
         if "fed" in count:
             count["used"] = count.pop("fed")
-    named = {}
-    for name, (value, cov) in outputs.items():
-        out = model.output(name)
-        unit = manifold.error_units(out.space)[0]
-        named[name] = OutputEstimate(flat(value), flat(cov), out.frame, unit)
     notes = line.notes
     if output.instants.recovered is not None and (opened := flat(output.instants.recovered)).any():
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
@@ -236,7 +231,7 @@ def _collect(
         time_ns=line.time_ns[valid],
         state=belief.mean,
         cov=np.asarray(belief.cov),
-        outputs=named,
+        outputs=named_outputs(model, jax.tree.map(flat, outputs)),
         sensors=sensors,
         log_likelihood=total,
         account=account,
@@ -244,6 +239,15 @@ def _collect(
         notes=notes,
         provenance=provenance() | {"recording": str(recording.path or recording.name)},
     )
+
+
+def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:
+    """Values and covariances of the model's outputs with their frames and units."""
+    named = {}
+    for name, (value, cov) in outputs.items():
+        out = model.output(name)
+        named[name] = OutputEstimate(value, cov, out.frame, manifold.error_units(out.space)[0])
+    return named
 
 
 def _sensor_record(innovation: Any, rows: Any, line: Timeline, fast: bool) -> SensorRecord:

@@ -6,7 +6,6 @@ every measurement simply stands at its own time; `estimate_online` tells what th
 said, and `jaxekf.stream.Stream` is that system.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,13 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxekf import ekf, manifold, parameters, timeline
+from jaxekf import ekf, timeline
 from jaxekf.errors import ModelError
-from jaxekf.estimation import Run, estimate_many, evaluate_outputs, read, sharing_devices
+from jaxekf.estimation import (
+    Run,
+    estimate_many,
+    evaluate_outputs,
+    named_outputs,
+    read,
+    sharing_devices,
+)
 from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.recording import NANOSECONDS, Times, period_ns
-from jaxekf.result import Estimate, OutputEstimate
+from jaxekf.result import Estimate
 from jaxekf.timeline import Knots, Steps, Timeline
 
 _EPOCHS_AT_ONCE = 2048
@@ -96,8 +102,7 @@ def carry_on(
 @partial(jit, static_argnums=0)
 def _told(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -> Any:
     count = steps.dt.shape[0]
-    setup = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), params.setup)
-    every = parameters.for_runs(params, setup, count)
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), params)
     output = carry_on(model, every, beliefs, steps)
     return output.instants.updated, evaluate_outputs(model, every, output)
 
@@ -133,7 +138,7 @@ def estimate_online(
         time_ns=view.time_ns[view.wanted],
         state=belief.mean,
         cov=belief.cov,
-        outputs=_named(chosen, outputs),
+        outputs=named_outputs(chosen, outputs),
         notes=(*made.notes, f"what was known at each time, measurements {late / 1e6:g} ms late"),
     )
 
@@ -155,11 +160,3 @@ def _in_parts(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -
         found = jax.tree.map(np.asarray, _told(model, params, *given))
         parts.append(jax.tree.map(lambda a, s=start: a[: min(size, count - s)], found))
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
-
-
-def _named(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:
-    named = {}
-    for name, (value, cov) in outputs.items():
-        out = model.output(name)
-        named[name] = OutputEstimate(value, cov, out.frame, manifold.error_units(out.space)[0])
-    return named

@@ -6,6 +6,7 @@ not to be believed (a hidden tracker, a zero quaternion) is invalid, not removed
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -86,7 +87,7 @@ class Markers:
 
     per_sample: ClassVar = ("position", "visible", "quality", "error")
 
-    @property
+    @cached_property
     def usable(self) -> Flags:
         """(N, M): visible, finite and of sufficient quality."""
         usable = self.visible & np.isfinite(self.position).all(axis=2)

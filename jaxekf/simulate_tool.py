@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from jaxekf.models import inertial, tight
 from jaxekf.recording import Encoder, Floats, Imu, Markers, Recording, Times, to_scipy
 from jaxekf.simulate import Motion, sample_times, seconds
 
-GRAVITY_REF = np.array([0.0, 0.0, -9.80665])
+GRAVITY_REF = np.array(inertial.STANDARD_GRAVITY)
 _G = 9.80665
 
 
@@ -99,9 +99,7 @@ class Tool:
     """Where the markers sit in the IMU's frame."""
 
     names: tuple[str, ...] = ("1", "2", "3")
-    p_body_marker: Floats = field(
-        default_factory=lambda: np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
-    )
+    p_body_marker: Floats = field(default_factory=tight.L_SHAPE.copy)
     """(M, 3) metres; by default an L with legs of 10 cm and the IMU at its corner."""
 
 
@@ -209,4 +207,4 @@ def _biased(
 
 def raw_yaw(q: Floats) -> Floats:
     """Heading (N,) in radians of quaternions (N, 4)."""
-    return Rotation.from_quat(np.roll(q, -1, axis=1)).as_euler("ZYX")[:, 0]
+    return to_scipy(q).as_euler("ZYX")[:, 0]

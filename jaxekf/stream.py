@@ -15,7 +15,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters, Sensor
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import NANOSECONDS, Floats
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf.timeline import Rows, Steps, knots_from
 
 _INPUT_KEPT_NS = NANOSECONDS
 """The input before the horizon that a clock offset may reach back to."""
@@ -73,7 +73,6 @@ class Stream:
         self._times: list[int] = []
         self._values: list[Floats] = []
         self._samples: dict[int, dict[str, _Sample]] = {}
-        self._advance = partial(_advance, model)
 
     def put_input(self, time_ns: int, value: Any) -> None:
         """A sample of the input, such as the IMU's; they come in order of time."""
@@ -125,7 +124,7 @@ class Stream:
     def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
         """Filter over these instants; the first `final` of them become final."""
         steps = self._steps(instants)
-        output, outputs = self._advance(self.params, self._belief, self._refused, steps)
+        output, outputs = _advance(self.model, self.params, self._belief, self._refused, steps)
         count = len(instants)
         if not np.asarray(output.instants.healthy)[:count].all():
             raise FilterError(
@@ -154,7 +153,8 @@ class Stream:
         time = (times - self._start_ns) / NANOSECONDS
         every = np.ones((len(times), 1), bool)
         fast = {sensor.name: self._rows(sensor, instants) for sensor in self.model.sensors}
-        steps = Steps(time[:, None], dt[:, None], every, self._knots(), fast, {})
+        inputs = knots_from(np.array(self._times, np.int64), self._values, self._start_ns)
+        steps = Steps(time[:, None], dt[:, None], every, inputs, fast, {})
         knots = padding.bucket(max(len(self._times), self._capacity))
         return padding.pad(steps, self._capacity, 1, knots)
 
@@ -174,13 +174,6 @@ class Stream:
         """Seconds between the sensor's open samples; only a gate's patience counts them."""
         times = sorted(t for t, s in self._samples.items() if sensor in s)
         return float(np.median(np.diff(times))) / NANOSECONDS if len(times) > 1 else 0.0
-
-    def _knots(self) -> Knots:
-        time = (np.array(self._times, np.int64) - self._start_ns) / NANOSECONDS
-        value = np.stack(self._values)
-        steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]
-        integral = np.concatenate([np.zeros_like(value[:1]), np.cumsum(steps, axis=0)])
-        return Knots(time, value, integral)
 
 
 def _blank(space: Any) -> Any:

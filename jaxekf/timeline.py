@@ -118,7 +118,7 @@ def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = Non
     index = _epochs(times, [samples[name].time_ns for name in slow])
     steps, step_times = _lay_out(times, index, samples, slow, start)
     if driver is not None:
-        steps = steps._replace(knots=_knots(driver, start))
+        steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
     if found is None:
         found = Start(start, {name: _first_visible(stream) for name, stream in samples.items()})
     notes = (found.note,) if found.note else ()
@@ -399,9 +399,10 @@ def _rows(samples: Samples, asked: Times) -> Rows:
     return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
 
 
-def _knots(driver: Samples, start: int) -> Knots:
-    time = (driver.time_ns - start) / NANOSECONDS
-    value = np.asarray(driver.value, float)
+def knots_from(time_ns: Times, value: Any, start: int) -> Knots:
+    """The knots of an input sampled at these times, in seconds since `start`."""
+    time = (time_ns - start) / NANOSECONDS
+    value = np.asarray(value, float)
     steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]
     integral = np.concatenate([np.zeros_like(value[:1]), np.cumsum(steps, axis=0)])
     return Knots(time, value, integral)

@@ -5,6 +5,7 @@ IMU's frame, errors of attitude act on the right, gravity is free fall. Their eq
 ``[0, t_s w]`` where the exponential belongs, and eqs. 21 and 22 have no noise: biases walk here.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxekf import linalg, pose, rotation
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Output, Parameters
-from jaxekf.recording import Recording
+from jaxekf.recording import Optical, Recording
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
@@ -144,12 +145,12 @@ def initial_mean(first: Any) -> State:
     )
 
 
-def setup(recording: Recording, raw: Any) -> Setup:
-    """Gravity and object frame of a recording; gravity found from its poses `raw` where not stated."""
+def setup(recording: Recording, raw: Callable[[], Optical]) -> Setup:
+    """Gravity and object frame of a recording; gravity found from its poses `raw()` where not stated."""
     info = recording.info
     stated = info.get("gravity_ref")
     if stated is None:
-        stated = pose.gravity(raw, recording.need_imu(), recording.path or recording.name)
+        stated = pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
     frame = np.asarray(info.get("q_body_object", SETUP.q_body_object), float)
     return Setup(
         np.asarray(stated, float),

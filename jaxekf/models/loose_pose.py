@@ -5,6 +5,7 @@ tools, motion capture). Where a recording holds single markers only, their raw p
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -84,7 +85,9 @@ def _source(recording: Recording) -> Samples:
 
 
 def _setup(recording: Recording) -> Setup:
-    return Setup(*inertial.setup(recording, raw_pose(recording)), _tracked_point(recording))
+    return Setup(
+        *inertial.setup(recording, partial(raw_pose, recording)), _tracked_point(recording)
+    )
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:

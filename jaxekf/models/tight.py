@@ -87,7 +87,7 @@ def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
     places = dict(zip(markers.names, markers.p_body_marker, strict=True))
     # A marker that this recording does not have is never seen: any place will do.
     arms = np.array([places.get(name, np.zeros(3)) for name in names], float)
-    return Setup(*inertial.setup(recording, pose.from_markers(markers)), arms)
+    return Setup(*inertial.setup(recording, partial(pose.from_markers, markers)), arms)
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:

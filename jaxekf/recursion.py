@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from jaxekf import kernels
+from jaxekf import kernels, linalg
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
 from jaxekf.step import Moment, Outcome, Track, begin, predict, update
@@ -73,7 +73,7 @@ def _keep(what: What, outcome: Outcome) -> Kept:
     return Kept(
         outcome.prior if what.prior else None,
         outcome.after.belief.mean,
-        outcome.after.belief.cov if what.cov else None,
+        linalg.symmetrise(outcome.after.belief.cov) if what.cov else None,
         outcome.log_likelihood,
         outcome.healthy,
         outcome.used if what.used else {},
@@ -333,6 +333,7 @@ def _with_adjoint(
 
     def backward(saved: Any, cotangents: Any) -> Any:
         prepared, starts, given, flags, at_rest = saved
+        cotangents = _symmetric(cotangents)
         every = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
         live = tuple(
             not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
@@ -375,6 +376,20 @@ def _backward(
         return in_blocks(devices, _whole(system, scan), arrays, *trees)
 
     return over_more_runs(devices, run)
+
+
+def _symmetric(cotangents: Kept) -> Kept:
+    """The cotangents of the covariances kept, (runs, K, S, n, n), made symmetric."""
+
+    def symmetric(cov: Any) -> Any:
+        if cov is None or isinstance(cov, SymbolicZero):
+            return cov
+        return 0.5 * (cov + cov.swapaxes(-1, -2))
+
+    prior = cotangents.prior
+    if prior is not None:
+        prior = prior._replace(cov=symmetric(prior.cov))
+    return cotangents._replace(prior=prior, cov=symmetric(cotangents.cov))
 
 
 def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:

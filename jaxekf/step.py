@@ -77,14 +77,13 @@ def predict(
         prepared["transition"], belief.mean, moment.u, moment.dt, adjoint=adjoint
     )
     cov = _congruence(transition.state, f, belief.cov, adjoint)
-    direct = transition.noise.is_identity
+    if not transition.noise.is_identity:
+        sigma = algebra.on_diagonal(sigma) if transition.diagonal else sigma
+        return Belief(mean, cov + _congruence(transition.noise, g, sigma, adjoint))
     if transition.diagonal:
-        sigma = algebra.on_diagonal(sigma)
-    elif direct:
-        sigma = linalg.symmetrise(sigma)
-    return Belief(
-        mean, cov + (sigma if direct else _congruence(transition.noise, g, sigma, adjoint))
-    )
+        add = algebra.add_on_diagonal_with_adjoint if adjoint else algebra.add_on_diagonal
+        return Belief(mean, add(cov, sigma))
+    return Belief(mean, cov + linalg.symmetrise(sigma))
 
 
 def update(
@@ -296,9 +295,8 @@ def _correct(
         any_used = any_used | mask
     correction = system.correction
     mean, reset = correction.piece(constants, prior.mean, gained.delta, any_used, adjoint=adjoint)
-    cov = gained.cov
     if correction.reset.is_identity:
-        cov = linalg.symmetrise(cov)
-    else:
-        cov = _congruence(correction.reset, reset, cov, adjoint)
-    return Belief(mean, jnp.where(any_used[None, None], cov, prior.cov))
+        # Symmetric but for rounding, which the next prediction ends.
+        return Belief(mean, gained.cov)
+    cov = _congruence(correction.reset, reset, gained.cov, adjoint)
+    return Belief(mean, cov)

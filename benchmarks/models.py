@@ -16,7 +16,7 @@ from jax import Array, lax
 from jaxekf import jit, manifold, run_filter_batch
 from jaxekf.ekf import inputs_of
 from jaxekf.model import Belief, Model, Parameters
-from jaxekf.models import loose
+from jaxekf.models import loose, tight
 from jaxekf.timeline import Knots, Rows, Steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -94,18 +94,24 @@ def _steps(model: Model, runs: int) -> Steps:
         [np.zeros((runs, 1, channels)), np.cumsum(_DT * (values[:, 1:] + values[:, :-1]) / 2, 1)], 1
     )
     fast = {}
-    for sensor in model.sensors:
+    for index, sensor in enumerate(model.sensors):
         shape = (runs, _STEPS, 1)
         if model.name == "loose":
             value = np.zeros((*shape, 4))
             value[..., 0], aux = 1.0, None
         else:
-            arm = model.parameters.calibration.p_body_marker[int(sensor.name[-1])]
-            value, aux = arm + 1e-4 * rng.normal(size=(*shape, 3)), np.ones(shape)
+            value = _arms(model)[index] + 1e-4 * rng.normal(size=(*shape, 3))
+            aux = np.zeros(shape) if model.name == "tight" else np.ones(shape)
         mask = np.ones((*shape, sensor.rows), bool)
         fast[sensor.name] = Rows(value, aux, mask, np.full(shape, _DT))
     knots = Knots(time[..., 0], values, integral)
     return Steps(time, dt, np.ones((runs, _STEPS, 1), bool), knots, fast, {})
+
+
+def _arms(model: Model) -> np.ndarray:
+    """Where the markers of a model are in the body, (M, 3) metres."""
+    holder = model.parameters.setup if model.name == "tight" else model.parameters.calibration
+    return np.asarray(holder.p_body_marker)
 
 
 def _ungated(model: Model) -> Model:
@@ -117,7 +123,8 @@ def race(seconds: float) -> dict[str, dict[str, float]]:
     found = {}
     for name, model in (
         ("loose", loose.MODEL),
-        ("markers, 15 d.o.f.", _ungated(toy_models.MARKERS)),
+        ("tight, three markers", _ungated(tight.MODEL)),
+        ("toy of markers, 15 d.o.f.", _ungated(toy_models.MARKERS)),
     ):
         params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
         steps = jax.tree.map(jnp.asarray, _steps(model, _RUNS))

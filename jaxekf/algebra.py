@@ -201,7 +201,7 @@ def solve(factored: _Factor, right: list[Array]) -> list[Array]:
     return solved
 
 
-class _Solved(NamedTuple):
+class Solved(NamedTuple):
     """What an update and its derivative share; lists are over rows, each (columns, lanes)."""
 
     factored: _Factor
@@ -246,12 +246,12 @@ def _innovation_column(
     return jnp.where(mask[j:] & mask[j][None], value, first.astype(value.dtype))
 
 
-def _solve(p: Pattern, gained: Gained, rows: Rows, with_inverse: bool) -> _Solved:
+def _solve(p: Pattern, gained: Gained, rows: Rows, with_inverse: bool) -> Solved:
     count = range(rows.mask.shape[0])
     right = [loop(partial(_right, p, i, with_inverse), rows.slope, gained, rows) for i in count]
     column = partial(_innovation_column, p)
     factored = factor(len(count), column, rows.slope, right, rows.noise, rows.mask)
-    return _Solved(factored, right, solve(factored, right))
+    return Solved(factored, right, solve(factored, right))
 
 
 def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
@@ -259,9 +259,9 @@ def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
     return written_sum([outer(a, b) for a, b in zip(left, right, strict=True)])
 
 
-def _take(
+def take(
     p: Pattern, gained: Gained, rows: Rows, with_inverse: bool = False
-) -> tuple[Gained, Array, _Solved]:
+) -> tuple[Gained, Array, Solved]:
     """The state after a block of rows, their smallest pivot, and what the derivative needs.
 
     The covariance is symmetric but for rounding; its cotangent must be symmetric.
@@ -302,7 +302,7 @@ def _take(
     return Gained(cov, delta, log_likelihood), smallest, found
 
 
-def _surprise(size: int, found: _Solved, mask: Array) -> Array:
+def _surprise(size: int, found: Solved, mask: Array) -> Array:
     """``e' inv(S) e + log det (2 pi S)`` of the rows that count; `size` columns before e."""
     squares = [s[size] * r[size] for s, r in zip(found.solved, found.right, strict=True)]
     # Few logarithms: pivots are multiplied first, few enough that no product over- or underflows.
@@ -320,7 +320,7 @@ def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
 
     The covariance is symmetric but for rounding, and making it exactly so is left to the caller.
     """
-    after, smallest, _ = _take(p, gained, rows)
+    after, smallest, _ = take(p, gained, rows)
     return after, smallest
 
 
@@ -405,7 +405,7 @@ def update_with_adjoint(p: Pattern, diagonal: bool) -> Any:
         return update(p, gained, rows)
 
     def forward(gained: Gained, rows: Rows) -> Any:
-        after, smallest, found = _take(p, gained, rows, with_inverse=True)
+        after, smallest, found = take(p, gained, rows, with_inverse=True)
         solved = loop(jnp.stack, found.solved)
         return (after, smallest), _Saved(after.cov, after.delta, solved, rows.slope, rows.mask)
 

@@ -139,17 +139,8 @@ def run_filter_batch(
             f"got keep='{keep}', expected one of {sorted(_KEPT)}; choose what is to be kept"
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
-    if 0 in steps.dt.shape:
-        raise ModelError(
-            f"got steps of shape {steps.dt.shape} (runs, epochs, substeps), expected at least one of"
-            " each; leave out runs without data"
-        )
-    inputs = jax.vmap(partial(inputs_of, model))(params, steps)
-    sizes: Any = _one_sample((params, belief.mean), 1)
-    u, fast = _one_sample((inputs, steps.fast), 3)
-    ready = system.build(model, sizes[0], sizes[1], u, fast | _one_sample(steps.slow, 2))
-    prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
-    given = Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
+    ready, prepared, given = made_ready(model, params, belief, steps)
+    inputs = given.moments.u
     what = _KEPT[keep]
     if adjoint:
         runs, epochs = steps.dt.shape[:2]
@@ -169,6 +160,27 @@ def run_filter_batch(
     )
     innovations = _innovations(model, params, inputs, steps, kept) if what.used else {}
     return FilterOutput(instants, inputs, innovations)
+
+
+def made_ready(
+    model: Model, params: Parameters, belief: Belief, steps: Steps
+) -> tuple[system.System, Any, Given]:
+    """The model on lanes, what its steps need of the parameters, and what they are driven with; all
+    arguments and the last two results carry the runs on the first axis.
+
+    Raises `ModelError` where there is no run or no step.
+    """
+    if 0 in steps.dt.shape:
+        raise ModelError(
+            f"got steps of shape {steps.dt.shape} (runs, epochs, substeps), expected at least one of"
+            " each; leave out runs without data"
+        )
+    inputs = jax.vmap(partial(inputs_of, model))(params, steps)
+    sizes: Any = _one_sample((params, belief.mean), 1)
+    u, fast = _one_sample((inputs, steps.fast), 3)
+    ready = system.build(model, sizes[0], sizes[1], u, fast | _one_sample(steps.slow, 2))
+    prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
+    return ready, prepared, Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
 
 
 def _one_sample(tree: Any, axes: int) -> Any:

@@ -289,6 +289,44 @@ def filter_plainly(
     return in_blocks((), runs, None, prepared, first, given)[0]
 
 
+def with_own_derivative(
+    devices: Devices, plain: bool, scan: Callable[..., Any]
+) -> Callable[..., Any]:
+    """A scan of trees with lanes last as a function of many runs, on the first axis.
+
+    Its reverse derivative is JAX's own, taken block by block on lanes; `vmap` of both is the same for more
+    runs. `plain` says that the scan is arithmetic only.
+    """
+    whole = partial(kernels.block, scan) if plain else scan
+
+    def run(_: None, *trees: Any) -> Any:
+        return in_blocks(devices, lambda _, *trees: (whole(*trees), None), None, *trees)
+
+    def run_back(_: None, cotangents: Any, *trees: Any) -> Any:
+        def one(_: None, cotangents: Any, *trees: Any) -> Any:
+            floats, put = _inexact(trees)
+            return jax.vjp(lambda floats: scan(*put(floats)), floats)[1](cotangents)[0], None
+
+        return in_blocks(devices, one, None, cotangents, *trees)
+
+    ahead, back = over_more_runs(devices, run), over_more_runs(devices, run_back)
+
+    @jax.custom_vjp
+    def function(*trees: Any) -> Any:
+        return ahead(None, *trees)[0]
+
+    def backward(trees: Any, cotangents: Any) -> Any:
+        return _unfilled(trees, None, back(None, cotangents, *trees)[0])
+
+    function.defvjp(lambda *trees: (function(*trees), trees), backward)
+    return function
+
+
+def on_lanes(scan: Callable[..., Any], *trees: Any) -> Any:
+    """A scan of trees with lanes last, for many runs, with JAX's own derivatives in both modes."""
+    return in_blocks((), lambda _, *trees: (scan(*trees), None), None, *trees)[0]
+
+
 def filter_with_adjoint(
     system: System,
     what: What,

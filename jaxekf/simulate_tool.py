@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,6 +53,11 @@ class ToolMotion:
     def position(self, t: Floats) -> Floats:
         """(N, 3) metres in the reference frame."""
         return (self.amplitude * np.sin(self._argument(t))).sum(axis=2)
+
+    def velocity(self, t: Floats) -> Floats:
+        """(N, 3), m/s, reference frame."""
+        turning = 2.0 * np.pi * self.frequency
+        return (self.amplitude * turning * np.cos(self._argument(t))).sum(axis=2)
 
     def acceleration(self, t: Floats) -> Floats:
         """(N, 3), m/s^2, reference frame."""
@@ -118,6 +124,17 @@ def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: floa
     return hidden
 
 
+class Unrecorded(NamedTuple):
+    """What is true at the IMU's instants and in no recording; each (N, 3)."""
+
+    velocity: Floats
+    """m/s, reference frame."""
+    bias: Floats
+    """Of the gyroscope, rad/s."""
+    accelerometer_bias: Floats
+    """m/s^2."""
+
+
 def tool_recording(
     name: str,
     motion: ToolMotion,
@@ -134,6 +151,30 @@ def tool_recording(
     The encoder holds the truth at the IMU's instants. All times start at `start_ns`: the first frame is
     taken there and arrives later by the latency.
     """
+    return tool_run(
+        name,
+        motion,
+        seed=seed,
+        duration_s=duration_s,
+        grade=grade,
+        tool=tool,
+        hidden=hidden,
+        start_ns=start_ns,
+    )[0]
+
+
+def tool_run(
+    name: str,
+    motion: ToolMotion,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: ToolGrade | None = None,
+    tool: Tool | None = None,
+    hidden: Hidden = (),
+    start_ns: int = 0,
+) -> tuple[Recording, Unrecorded]:
+    """As `tool_recording`, with what else is true."""
     grade, tool = grade or ToolGrade(), tool or Tool()
     rng = np.random.default_rng([seed, 6])
     taken = sample_times(1.0 / grade.tracker_s, duration_s, start_ns)
@@ -142,9 +183,10 @@ def tool_recording(
     q, _ = motion.attitude.attitude(seconds(imu_ns))
     known = np.ones(len(imu_ns), bool)
     truth = Encoder(imu_ns, q, known, known, motion.position(seconds(imu_ns)))
-    imu = tool_imu(motion, imu_ns, rng, grade)
+    imu, *biases = tool_imu(motion, imu_ns, rng, grade)
     info = {"simulated": True, "seed": seed, "gravity_ref": GRAVITY_REF.tolist()}
-    return Recording(name, None, imu, truth, info, markers=markers)
+    recording = Recording(name, None, imu, truth, info, markers=markers)
+    return recording, Unrecorded(motion.velocity(seconds(imu_ns)), *biases)
 
 
 def tool_markers(
@@ -171,12 +213,14 @@ def tool_markers(
     )
 
 
-def tool_imu(motion: ToolMotion, time_ns: Times, rng: np.random.Generator, grade: ToolGrade) -> Imu:
-    """Gyroscope and accelerometer with white noise and biases that walk."""
+def tool_imu(
+    motion: ToolMotion, time_ns: Times, rng: np.random.Generator, grade: ToolGrade
+) -> tuple[Imu, Floats, Floats]:
+    """Gyroscope and accelerometer with white noise, and the biases, which walk, of each."""
     t = seconds(time_ns)
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - GRAVITY_REF)
-    turning = _biased(
+    turning, bias = _biased(
         rate,
         rng,
         grade.imu_s,
@@ -184,7 +228,7 @@ def tool_imu(motion: ToolMotion, time_ns: Times, rng: np.random.Generator, grade
         np.deg2rad(grade.bias_walk_deg),
         np.deg2rad(grade.bias_deg),
     )
-    pushing = _biased(
+    pushing, accelerometer_bias = _biased(
         force,
         rng,
         grade.imu_s,
@@ -192,17 +236,18 @@ def tool_imu(motion: ToolMotion, time_ns: Times, rng: np.random.Generator, grade
         grade.accelerometer_walk,
         grade.accelerometer_bias,
     )
-    return Imu(time_ns, turning, pushing)
+    return Imu(time_ns, turning, pushing), bias, accelerometer_bias
 
 
 def _biased(
     exact: Floats, rng: np.random.Generator, dt: float, white: float, walk: float, start: float
-) -> Floats:
-    """Samples with white noise, and a bias that starts at random and walks."""
-    bias = start * rng.standard_normal(3)
+) -> tuple[Floats, Floats]:
+    """Samples with white noise and a bias that starts at random and walks, and that bias."""
+    first = start * rng.standard_normal(3)
     steps = walk * np.sqrt(dt) * rng.standard_normal(exact.shape)
     noise = white / np.sqrt(dt) * rng.standard_normal(exact.shape)
-    return exact + bias + np.cumsum(steps, axis=0) + noise
+    bias = first + np.cumsum(steps, axis=0)
+    return exact + bias + noise, bias
 
 
 def raw_yaw(q: Floats) -> Floats:

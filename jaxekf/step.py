@@ -1,5 +1,7 @@
 """One step of the filter on lanes: predict, compare, update."""
 
+import operator
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -57,11 +59,21 @@ def begin(system: System, belief: Belief, refused: Array | None) -> Track:
     return Track(belief, refused)
 
 
-class _Linear(NamedTuple):
+class Linear(NamedTuple):
     """One sensor linearised: rows, and the pattern of their slope."""
 
     slope: Pattern
     rows: algebra.Rows
+
+
+class Gates(NamedTuple):
+    """What the gates of all sensors make of the samples of one instant."""
+
+    gated: dict[str, Array]
+    refused: Array | None
+    recovered: Array | None
+    widened: Array | None
+    """(lanes,) what the predicted covariance is multiplied by."""
 
 
 def predict(
@@ -97,25 +109,16 @@ def update(
 ) -> Outcome:
     """Take every sensor sampled at the end of a substep; `adjoint` as in `predict`."""
     prior = ahead.belief
-    seen: dict[str, _Linear] = {}
-    for name, sample in samples.items():
-        measurement = system.measurements[name]
-        constants = prepared[f"sensor {name}"]
-        found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
-        residual, slope, noise = found
-        seen[name] = _hide(measurement, residual, slope, noise, sample.mask)
-    gates = _gates(system, seen, samples, ahead)
-    linear = {name: _without(one, gates.gated[name]) for name, one in seen.items()}
+    linear, cov, gates = look(system, prepared, ahead, u, samples, adjoint=adjoint)
     used = {name: one.rows.mask for name, one in linear.items()}
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
         nothing, sound = jnp.zeros(lanes, dtype), _is_sound(prior.cov)
         never = None if ahead.refused is None else jnp.zeros(lanes, bool)
         return Outcome(prior, ahead, nothing, sound, used, gates.gated, never)
-    cov = prior.cov if gates.widened is None else prior.cov * gates.widened[None, None]
     gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
-    for slope, rows in _blocks(system, linear):
+    for slope, rows in blocks_of_rows(system, linear):
         gained, pivot = _take(slope, gained, rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
     posterior = _correct(
@@ -124,6 +127,31 @@ def update(
     healthy = (smallest > 0.0) & _is_sound(posterior.cov)
     after = Track(posterior, gates.refused)
     return Outcome(prior, after, gained.log_likelihood, healthy, used, gates.gated, gates.recovered)
+
+
+def look(
+    system: System,
+    prepared: Any,
+    ahead: Track,
+    u: Any,
+    samples: dict[str, Rows],
+    *,
+    adjoint: bool,
+) -> tuple[dict[str, Linear], Array, Gates]:
+    """Every sensor linearised at the prediction, with what its gate refuses hidden; the predicted
+    covariance, widened where the gates were opened; and what the gates did."""
+    prior = ahead.belief
+    seen: dict[str, Linear] = {}
+    for name, sample in samples.items():
+        measurement = system.measurements[name]
+        constants = prepared[f"sensor {name}"]
+        found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
+        residual, slope, noise = found
+        seen[name] = _hide(measurement, residual, slope, noise, sample.mask)
+    gates = _gates(system, seen, samples, ahead)
+    linear = {name: _without(one, gates.gated[name]) for name, one in seen.items()}
+    cov = prior.cov if gates.widened is None else prior.cov * gates.widened[None, None]
+    return linear, cov, gates
 
 
 def _is_sound(cov: Array) -> Array:
@@ -143,33 +171,23 @@ def _congruence(p: Pattern, block: Array | None, cov: Array, adjoint: bool) -> A
 
 def _hide(
     measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
-) -> _Linear:
+) -> Linear:
     """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
     if slope is not None:
         rows = patterned.take(mask, measurement.slope.rows, 0)
         slope = jnp.where(rows[:, None], slope, 0.0)
     both = mask if measurement.diagonal else mask[:, None] & mask[None]
     noise = jnp.where(both, noise, 0.0)
-    return _Linear(measurement.slope, algebra.Rows(residual, slope, noise, mask))
+    return Linear(measurement.slope, algebra.Rows(residual, slope, noise, mask))
 
 
-def _without(linear: _Linear, gated: Array) -> _Linear:
+def _without(linear: Linear, gated: Array) -> Linear:
     return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
 
 
-class _Gates(NamedTuple):
-    """What the gates of all sensors make of the samples of one instant."""
-
-    gated: dict[str, Array]
-    refused: Array | None
-    recovered: Array | None
-    widened: Array | None
-    """(lanes,) what the predicted covariance is multiplied by."""
-
-
 def _gates(
-    system: System, seen: dict[str, _Linear], samples: dict[str, Rows], ahead: Track
-) -> _Gates:
+    system: System, seen: dict[str, Linear], samples: dict[str, Rows], ahead: Track
+) -> Gates:
     """Rows that are kept out, and the way back for a belief that keeps everything out.
 
     Where gates have let nothing in while they refused samples for longer than the model's patience, it
@@ -181,9 +199,9 @@ def _gates(
     prior = ahead.belief.cov
     none = jnp.zeros(prior.shape[-1], bool)
     if ahead.refused is None:
-        return _Gates(gated, None, None, None)
+        return Gates(gated, None, None, None)
     if not watched:
-        return _Gates(gated, ahead.refused, none, None)
+        return Gates(gated, ahead.refused, none, None)
     let_in, kept_out, finite = none, none, {}
     refused_s, excess = jnp.zeros_like(ahead.refused), jnp.ones_like(ahead.refused)
     for name in watched:
@@ -202,10 +220,10 @@ def _gates(
     recovered = kept_out & ~let_in & (ahead.refused > system.model.patience_s)
     gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
     widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
-    return _Gates(gated, jnp.where(recovered, 0.0, refused), recovered, widened)
+    return Gates(gated, jnp.where(recovered, 0.0, refused), recovered, widened)
 
 
-def _gate(sensor: Sensor, linear: _Linear, prior: Array) -> tuple[Array, list[Array]]:
+def _gate(sensor: Sensor, linear: Linear, prior: Array) -> tuple[Array, list[Array]]:
     """Visible rows whose group lies outside its chi-square bound; and for each row how many times
     larger than expected its group's squared error is."""
     rows = linear.rows
@@ -239,7 +257,7 @@ def _take(
     return algebra.update(slope, gained, rows)
 
 
-def _blocks(system: System, linear: dict[str, _Linear]) -> list[tuple[Pattern, algebra.Rows]]:
+def blocks_of_rows(system: System, linear: dict[str, Linear]) -> list[tuple[Pattern, algebra.Rows]]:
     """Rows in blocks that are taken at once: whole sensors together while they are small."""
     groups: list[list[str]] = []
     size = 0
@@ -254,7 +272,7 @@ def _blocks(system: System, linear: dict[str, _Linear]) -> list[tuple[Pattern, a
     return [_joined(system, [linear[name] for name in names], names) for names in groups]
 
 
-def _joined(system: System, parts: list[_Linear], names: list[str]) -> tuple[Pattern, algebra.Rows]:
+def _joined(system: System, parts: list[Linear], names: list[str]) -> tuple[Pattern, algebra.Rows]:
     """Rows of several sensors as one block."""
     if len(parts) == 1:
         return parts[0].slope, parts[0].rows
@@ -285,16 +303,21 @@ def _block_diagonal(matrices: list[Array]) -> Array:
     return jnp.concatenate(rows)
 
 
+def any_of(masks: list[Array]) -> Array:
+    """(lanes,) where any row of any mask counts."""
+    every = [mask[i] for mask in masks for i in range(mask.shape[0])]
+    return reduce(operator.or_, every)
+
+
 def _correct(
     system: System, constants: Any, prior: Belief, gained: Gained, masks: list[Array], adjoint: bool
 ) -> Belief:
     """The mean moved by the error vector and the covariance counted from there."""
-    every = [mask[i] for mask in masks for i in range(mask.shape[0])]
-    any_used = every[0]
-    for mask in every[1:]:
-        any_used = any_used | mask
+    any_used = any_of(masks)
     correction = system.correction
-    mean, reset = correction.piece(constants, prior.mean, gained.delta, any_used, adjoint=adjoint)
+    mean, reset, _ = correction.piece(
+        constants, prior.mean, gained.delta, any_used, adjoint=adjoint
+    )
     if correction.reset.is_identity:
         # Symmetric but for rounding, which the next prediction ends.
         return Belief(mean, gained.cov)

@@ -136,7 +136,8 @@ class Correction(NamedTuple):
     """How an error vector moves the mean, and how the covariance follows."""
 
     piece: Piece
-    """``(params, x, delta, any_used)`` to the mean and the unknown block of the reset Jacobian."""
+    """``(params, x, delta, any_used)`` to the mean, the unknown block of the reset Jacobian, and how
+    far, as an error vector, the model's constraint moved the mean; None without one."""
     reset: Pattern
 
 
@@ -245,13 +246,16 @@ def _correction(model: Model, params: Any, x: Any) -> Correction:
     reset = patterned.pattern(_known(partial(manifold.reset_jacobian, model.space), delta))
 
     def move(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
-        mean = manifold.retract(model.space, x, delta)
+        moved = manifold.retract(model.space, x, delta)
+        mean, shift, block = moved, None, None
         if model.project is not None:
-            mean = model.project(mean)
+            mean = model.project(moved)
+            shift = manifold.local(model.space, moved, mean)
+            shift = jnp.where(any_used, shift, 0.0)
         mean = manifold.copy_where(any_used, mean, x)
-        if not reset.rows:
-            return mean, None
-        jacobian = manifold.reset_jacobian(model.space, delta)
-        return mean, patterned.take(patterned.take(jacobian, reset.rows, 0), reset.cols, 1)
+        if reset.rows:
+            jacobian = manifold.reset_jacobian(model.space, delta)
+            block = patterned.take(patterned.take(jacobian, reset.rows, 0), reset.cols, 1)
+        return mean, block, shift
 
     return Correction(Piece(move, params, x, delta, used), reset)

@@ -61,7 +61,7 @@ def _update(model, params, x, p, u, samples):
         _look(model, model.sensor(name), params, x, p, u, rows) for name, rows in samples.items()
     ]
     if not looks:
-        return x, p, 0.0
+        return x, p, 0.0, jnp.zeros(model.error_dim)
     e, h, mask = (jnp.concatenate([look[i] for look in looks]) for i in (0, 1, 3))
     r = jax.scipy.linalg.block_diag(*[look[2] for look in looks])
     e, h = jnp.where(mask, e, 0.0), jnp.where(mask[:, None], h, 0.0)
@@ -86,11 +86,16 @@ def _update(model, params, x, p, u, samples):
         y = model.project(y)
     some = jnp.any(mask)
     x, p = jax.tree.map(lambda a, b: jnp.where(some, a, b), (y, joseph), (x, p))
-    return x, p, gained
+    return x, p, gained, jnp.where(some, delta, 0.0)
 
 
 def run(model, params, belief, steps):
     """Predicted and updated means and covariances, (K, S, ...), and log-likelihoods (K, S)."""
+    return _run(model, params, belief, steps)[:3]
+
+
+def _run(model, params, belief, steps):
+    """As `run`, with the error vectors by which the updates moved the means."""
     inputs = ekf.inputs_of(model, params, steps)
     epochs, substeps = steps.dt.shape
     last = jnp.arange(substeps) == substeps - 1
@@ -103,11 +108,83 @@ def run(model, params, belief, steps):
     def step(carry, given):
         dt, u, samples = given
         before = _predict(model, params, *carry, u, dt)
-        *carry, gained = _update(model, params, *before, u, samples)
-        return tuple(carry), (before, tuple(carry), gained)
+        *carry, gained, delta = _update(model, params, *before, u, samples)
+        return tuple(carry), (before, tuple(carry), gained, delta)
 
     samples = steps.fast | {name: everywhere(rows) for name, rows in steps.slow.items()}
     given = (steps.dt, inputs, samples)
     one_by_one = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), given)
     found = lax.scan(step, tuple(belief), one_by_one)[1]
     return jax.tree.map(lambda a: a.reshape(epochs, substeps, *a.shape[1:]), found)
+
+
+def smooth(model, params, belief, steps):
+    """Smoothed means and covariances, (K, S, ...), and those of the start: Rauch, Tung, Striebel with
+    an inverse of every predicted covariance, errors carried from mean to mean to first order.
+
+    Where a constraint moved the mean by c, what came later was counted from there; without that move it
+    would have said ``d + c - P_smoothed inv(P) c`` instead of d.
+    """
+    predicted, updated, _, moves = _run(model, params, belief, steps)
+    flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (predicted, updated, moves))
+    inputs = jax.tree.map(
+        lambda a: a.reshape(-1, *a.shape[2:]), (steps.dt, ekf.inputs_of(model, params, steps))
+    )
+    earlier = jax.tree.map(
+        lambda first, later: jnp.concatenate([jnp.asarray(first)[None], later[:-1]]),
+        tuple(belief),
+        flat[1],
+    )
+
+    def counted_from(x, delta):
+        """The derivative of an error counted from ``retract(x, delta)`` by the one counted from x."""
+        y = manifold.retract(model.space, x, delta)
+        return _slope(
+            model.space,
+            lambda d: manifold.retract(model.space, x, delta + d),
+            x,
+            y,
+            model.error_dim,
+        )
+
+    def back(carry, given):
+        later, spread = carry
+        (x, p), (before, before_p), (after, after_p), moved, (dt, u) = given
+        shown = manifold.retract(model.space, after, later)
+        if model.project is not None:
+            shown = model.project(shown)
+            free = manifold.retract(model.space, x, moved)
+            c = manifold.local(model.space, free, model.project(free))
+            c = jnp.where(jnp.any(moved != 0.0), c, 0.0)
+        reset = counted_from(after, later)
+        found = shown, reset @ spread @ reset.T
+        if model.project is not None:
+            later = later + c - spread @ jnp.linalg.solve(after_p, c)
+        # From the updated mean to the predicted one.
+        turn = jnp.linalg.inv(counted_from(x, moved))
+        error, spread = turn @ later + moved, turn @ spread @ turn.T
+        predicted = model.transition(before, u, dt, jnp.zeros(params_noise(dt)), params)
+        f = _slope(
+            model.space,
+            lambda d: model.transition(
+                manifold.retract(model.space, before, d), u, dt, jnp.zeros(params_noise(dt)), params
+            ),
+            before,
+            predicted,
+            model.error_dim,
+        )
+        gain = jnp.linalg.solve(p, f @ before_p).T
+        return (gain @ error, before_p + gain @ (spread - p) @ gain.T), found
+
+    def params_noise(dt):
+        return model.process_noise(params, dt).shape[0]
+
+    start = jnp.zeros(model.error_dim), flat[1][1][-1]
+    given = (flat[0], earlier, flat[1], flat[2], inputs)
+    (delta, spread), found = lax.scan(back, start, given, reverse=True)
+    first = manifold.retract(model.space, belief.mean, delta)
+    first = first if model.project is None else model.project(first)
+    reset = counted_from(belief.mean, delta)
+    epochs, substeps = steps.dt.shape
+    shaped = jax.tree.map(lambda a: a.reshape(epochs, substeps, *a.shape[1:]), found)
+    return shaped, (first, reset @ spread @ reset.T)

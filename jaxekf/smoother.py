@@ -1,0 +1,78 @@
+"""The smoother: every instant given the whole run, on top of the filter of `jaxekf.ekf`.
+
+Rauch, Tung, Striebel on the state space of the model, in the form of `jaxekf.backward`: one pass back
+over what the filter left, linearised where the filter was. Compiled, batched and differentiated like
+the filter.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxekf import backward, ekf, recursion
+from jaxekf.backward import Filtered
+from jaxekf.ekf import FilterOutput
+from jaxekf.model import Belief, Model, Parameters
+from jaxekf.recursion import First
+from jaxekf.reverse_only import reverse_only
+from jaxekf.system import System
+from jaxekf.timeline import Steps
+
+
+class SmootherOutput(NamedTuple):
+    """A run filtered and smoothed."""
+
+    filtered: FilterOutput
+    """All that the filter left."""
+    smoothed: Belief
+    """At the end of each substep, leading axes (K, S)."""
+    start: Belief
+    """At the start of the run."""
+
+
+def run_smoother(
+    model: Model, params: Parameters, belief: Belief, steps: Steps, *, adjoint: bool = True
+) -> SmootherOutput:
+    """Filter and smooth one run from an initial belief; differentiable in everything.
+
+    Samples that the filter's gates refused stay refused. Options and errors as in `run_filter`.
+    """
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
+    found = run_smoother_batch(model, *one, adjoint=adjoint)
+    return jax.tree.map(lambda a: a[0], found)
+
+
+def run_smoother_batch(
+    model: Model,
+    params: Parameters,
+    belief: Belief,
+    steps: Steps,
+    *,
+    adjoint: bool = True,
+    devices: Sequence[Any] = (),
+) -> SmootherOutput:
+    """Filter and smooth many runs: every leaf of every argument carries the runs on its first axis.
+
+    Equal to calls of `run_smoother` one by one; options and errors as in `run_filter_batch`.
+    """
+    params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
+    filtered = ekf.run_filter_batch(
+        model, params, belief, steps, keep="everything", adjoint=adjoint, devices=devices
+    )
+    ready, prepared, given = ekf.made_ready(model, params, belief, steps)
+    at: Any = filtered.instants
+    trees = (prepared, First(belief), given, Filtered(at.predicted, at.updated, at.refused))
+    if adjoint:
+        smoothed, start = _lanes(ready, tuple(devices))(*reverse_only(trees))
+    else:
+        smoothed, start = recursion.on_lanes(partial(backward.scan_back, ready, False), *trees)
+    return SmootherOutput(filtered, smoothed, start)
+
+
+@lru_cache(maxsize=64)
+def _lanes(system: System, devices: tuple[Any, ...]) -> Any:
+    scan = partial(backward.scan_back, system, True)
+    return recursion.with_own_derivative(devices, system.is_plain, scan)

@@ -26,6 +26,7 @@ from jaxekf.parameters import load as load_parameters
 from jaxekf.parameters import save as save_parameters
 from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, Samples
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
 from jaxekf.storage import load, save
 from jaxekf.stream import Known, Stream
 
@@ -60,6 +61,7 @@ __all__ = [
     "Score",
     "Sensor",
     "SensorRecord",
+    "SmootherOutput",
     "Start",
     "Stream",
     "TuningError",
@@ -76,6 +78,8 @@ __all__ = [
     "rotation",
     "run_filter",
     "run_filter_batch",
+    "run_smoother",
+    "run_smoother_batch",
     "save",
     "save_parameters",
     "score",

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import ekf, manifold, padding, parameters, storage, timeline
+from jaxekf import ekf, manifold, padding, parameters, smoother, storage, timeline
 from jaxekf.ekf import FilterOutput
 from jaxekf.errors import FilterError, PrecisionError
 from jaxekf.kernels import jit
@@ -34,18 +34,29 @@ def require_float64() -> None:
         )
 
 
-def estimate(run: Run, model: str | Model = "loose", params: Parameters | None = None) -> Estimate:
+def estimate(
+    run: Run,
+    model: str | Model = "loose",
+    params: Parameters | None = None,
+    *,
+    smooth: bool = False,
+) -> Estimate:
     """Estimate one run: a `Recording` or the path of a recorded folder.
 
     `model` is a name, ``module:attribute`` or a `Model`; `params` are the model's defaults unless
-    given (see `jaxekf.load_parameters`). Raises `RecordingError` for what is wrong with the data,
+    given (see `jaxekf.load_parameters`). Each instant is estimated from what was measured until then
+    or, with `smooth`, from the whole run; innovations are those of the filter in both cases. Raises `RecordingError` for what is wrong with the data,
     `FilterError` where the recursion broke, `PrecisionError` in float32.
     """
-    return estimate_many([run], model, params)[0]
+    return estimate_many([run], model, params, smooth=smooth)[0]
 
 
 def estimate_many(
-    runs: Sequence[Run], model: str | Model = "loose", params: Parameters | None = None
+    runs: Sequence[Run],
+    model: str | Model = "loose",
+    params: Parameters | None = None,
+    *,
+    smooth: bool = False,
 ) -> list[Estimate]:
     """Estimate several runs side by side with the same parameters; equal to one call for each."""
     require_float64()
@@ -54,9 +65,9 @@ def estimate_many(
     timelines = timeline.build_many(chosen, recordings)
     used = parameters.as_arrays(chosen.parameters if params is None else params)
     parameters.check(used)
-    results = filter_timelines(chosen, used, timelines)
+    results = filter_timelines(chosen, used, timelines, smooth=smooth)
     return [
-        _collect(chosen, used, recording, line, *result)
+        _collect(chosen, used, recording, line, *result, smooth=smooth)
         for recording, line, result in zip(recordings, timelines, results, strict=True)
     ]
 
@@ -67,9 +78,9 @@ def read(runs: Sequence[Run]) -> list[Recording]:
 
 
 def filter_timelines(
-    model: Model, params: Parameters, lines: Sequence[Timeline]
+    model: Model, params: Parameters, lines: Sequence[Timeline], *, smooth: bool = False
 ) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
-    """Filter runs side by side, and check each.
+    """Filter runs side by side, and check each; with `smooth` the updated beliefs are the smoothed ones.
 
     Runs of like length are padded to a common one out of a few, so that few programs are compiled; more
     of them than fit into memory are taken one batch after the other.
@@ -85,7 +96,8 @@ def filter_timelines(
             # The last batch is filled with the last run: another size would be another program.
             index = np.minimum(np.arange(start, start + size), len(members) - 1)
             given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (stacked, steps))
-            found = jax.tree.map(np.asarray, _run(model, sharing_devices(), params, *given))
+            devices = sharing_devices()
+            found = jax.tree.map(np.asarray, _run(model, devices, smooth, params, *given))
             for place in range(min(size, len(members) - start)):
                 one = jax.tree.map(lambda a, place=place: a[place], found)
                 _check(model, lines[members[start + place]], one[0])
@@ -107,10 +119,11 @@ def sharing_devices() -> tuple[Any, ...]:
     return tuple(devices) if shared else ()
 
 
-@partial(jit, static_argnums=(0, 1))
+@partial(jit, static_argnums=(0, 1, 2))
 def _run(
     model: Model,
     devices: tuple[Any, ...],
+    smooth: bool,
     params: Parameters,
     starts: tuple[Any, Any],
     steps: Steps,
@@ -118,7 +131,13 @@ def _run(
     means, setup = starts
     every = parameters.for_runs(params, setup, steps.dt.shape[0])
     cov = jax.vmap(model.initial_covariance)(every)
-    output = ekf.run_filter_batch(model, every, Belief(means, cov), steps, devices=devices)
+    given = (model, every, Belief(means, cov), steps)
+    if smooth:
+        found = smoother.run_smoother_batch(*given, devices=devices)
+        instants = found.filtered.instants._replace(updated=found.smoothed)
+        output = found.filtered._replace(instants=instants)
+    else:
+        output = ekf.run_filter_batch(*given, devices=devices)
     return output, evaluate_outputs(model, every, output)
 
 
@@ -195,6 +214,8 @@ def _collect(
     line: Timeline,
     output: FilterOutput,
     outputs: dict[str, Any],
+    *,
+    smooth: bool,
 ) -> Estimate:
     """The filter's arrays without padding, in order of time."""
     epochs, substeps = line.time_ns.shape
@@ -224,6 +245,8 @@ def _collect(
             f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
             f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times",
         )
+    if smooth:
+        notes += ("smoothed: every instant is estimated from the whole run",)
     total = float(flat(output.instants.log_likelihood).sum())
     return Estimate(
         run=recording.name,
@@ -237,6 +260,7 @@ def _collect(
         account=account,
         params=params._replace(setup=line.setup),
         notes=notes,
+        smoothed=smooth,
         provenance=provenance() | {"recording": str(recording.path or recording.name)},
     )
 

@@ -72,6 +72,8 @@ class Estimate:
     notes: tuple[str, ...] = ()
     """What a user should know of how the run was read and started."""
     provenance: dict[str, Any] = field(default_factory=dict)
+    smoothed: bool = False
+    """Whether every instant was estimated from the whole run, not from what was measured until then."""
 
     @property
     def time(self) -> Floats:
@@ -124,6 +126,7 @@ class Estimate:
         return {
             "run": self.run,
             "model": self.model.name,
+            "smoothed": self.smoothed,
             "instants": len(self.time_ns),
             "duration_s": float(self.time[-1]),
             "log_likelihood": self.log_likelihood,

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
-from jaxekf import ekf, get_model, jit, manifold, metrics, rotation, simulate
+from jaxekf import get_model, jit, manifold, metrics, rotation, simulate, smoother
 from jaxekf.estimation import estimate_many
 from jaxekf.model import Belief
 from jaxekf.parameters import as_arrays
@@ -77,7 +77,9 @@ def blank_steps(name, epochs):
 
 @partial(jit, static_argnums=0)
 def monte_carlo(model, params, steps, keys):
-    """Attitude NEES (runs, K) at the ends of epochs and tracker NIS (runs, K) of simulated runs."""
+    """What became of simulated runs at the ends of epochs: the filter's attitude NEES and tracker NIS
+    (runs, K), health, the smoother's NEES of the whole state, and for filter and smoother the squared
+    attitude errors and what their covariances expect."""
 
     def one(key):
         first, second = jax.random.split(key)
@@ -91,29 +93,52 @@ def monte_carlo(model, params, steps, keys):
 
     truth, drawn, belief = jax.vmap(one)(keys)
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (len(keys), *a.shape)), params)
-    output = ekf.run_filter_batch(model, every, belief, drawn)
-    estimated = output.instants.updated
-    error = rotation.difference(estimated.mean.q_ref_body[:, :, -1], truth.q_ref_body[:, :, -1])
-    cov = estimated.cov[:, :, -1, :3, :3]
-    nees = jnp.sum(error * jnp.linalg.solve(cov, error[..., None])[..., 0], axis=-1)
-    return nees, output.innovations["optical"].nis, output.instants.healthy
+    found = smoother.run_smoother_batch(model, every, belief, drawn)
+    output = found.filtered
+
+    def squares(estimated):
+        error = rotation.difference(estimated.mean.q_ref_body[:, :, -1], truth.q_ref_body[:, :, -1])
+        cov = estimated.cov[:, :, -1, :3, :3]
+        nees = jnp.sum(error * jnp.linalg.solve(cov, error[..., None])[..., 0], axis=-1)
+        return nees, jnp.sum(error * error, axis=-1), jnp.trace(cov, axis1=-2, axis2=-1)
+
+    nees, *filtered = squares(output.instants.updated)
+    _, *smoothed = squares(found.smoothed)
+
+    def whole(mean, cov, true):
+        error = manifold.local(model.space, mean, true)
+        return error @ jnp.linalg.solve(cov, error)
+
+    ends = jax.tree.map(lambda a: a[:, :, -1], (*found.smoothed, truth))
+    every_part = jax.vmap(jax.vmap(whole))(*ends)
+    innovations = output.innovations["optical"].nis
+    return nees, innovations, output.instants.healthy, every_part, filtered, smoothed
 
 
 @pytest.mark.parametrize("name", ["loose", "loose_rate"])
 def test_errors_and_innovations_are_as_large_as_their_covariances(name):
-    """Would catch a wrong F, G, Q, R or reset, and noise that depends on the sampling rate."""
+    """Would catch a wrong F, G, Q, R or reset, noise that depends on the sampling rate, and a smoother
+    that promises more, or gains less, than the samples after an instant give."""
     model, params = get_model(name), parameters(name)
     settle = correlation_time(name, params)
     epochs = int(np.ceil(20.0 * settle / TRACKER_S)) + 50
     assert epochs * TRACKER_S >= 20.0 * settle
     keys = jax.random.split(jax.random.key(7), RUNS)
     steps = blank_steps(name, epochs)
-    nees, nis, healthy = (np.asarray(a) for a in monte_carlo(model, params, steps, keys))
+    found = jax.tree.map(np.asarray, monte_carlo(model, params, steps, keys))
+    nees, nis, healthy, smoothed_nees, filtered, smoothed = found
     assert healthy.all()
-    low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], 3 * RUNS) / RUNS
-    for values in (nees.mean(axis=0), nis[:, steps.slow["optical"].mask[:, 0]].mean(axis=0)):
+    seen = steps.slow["optical"].mask[:, 0]
+    for squares, freedom in ((nees, 3), (nis[:, seen], 3), (smoothed_nees, model.error_dim)):
+        values = squares.mean(axis=0)
+        low, high = chi2.ppf([0.5 * (1 - LEVEL), 0.5 * (1 + LEVEL)], freedom * RUNS) / RUNS
         inside = np.mean((values >= low) & (values <= high))
-        assert inside >= 0.9, (name, inside, values.mean())
+        assert inside >= 0.9, (name, inside, values.mean() / freedom)
+    for chosen in (seen, ~seen):
+        gained, expected = (
+            np.sqrt(smoothed[i][:, chosen].mean() / filtered[i][:, chosen].mean()) for i in (0, 1)
+        )
+        assert abs(gained / expected - 1.0) < 0.03, (name, gained, expected)
 
 
 @pytest.mark.long

@@ -5,7 +5,7 @@
 FOLDER holds BROAD's MATLAB files. Each trial keeps its real gyroscope; its motion-capture attitude is
 the truth, and a decimated, noisy, interrupted copy of it is the tracker. From hand-set noise, Q and R
 are tuned by gradient on the training trials together with the gyroscope's clock offset and matrix
-(`--noise-only` leaves those out), and the test trials are estimated before and after.
+(`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed.
 
 The last line printed is JSON with the attitude RMSE in degrees of each test trial.
 """
@@ -89,14 +89,18 @@ def main() -> None:
         key: [row.attitude_rmse_deg for row in compared.rows if row.variant == variant]
         for variant, key in columns.items()
     }
-    print(f"{'trial':<10}{'hold last':>12}{'initial':>10}{'tuned':>10}{'NIS':>8}{'NEES':>8}")
+    smoothed = jaxekf.estimate_many(testing, "loose", tuned.params, smooth=True)
+    summary["smoothed_deg"] = [
+        jaxekf.score(made, run).attitude_rmse_deg
+        for made, run in zip(smoothed, testing, strict=True)
+    ]
+    columns["smoothed"] = "smoothed_deg"
+    print("".join(f"{name:>12}" for name in ("trial", *columns, "NIS", "NEES")))
     checks = [row for row in compared.rows if row.variant == "tuned"]
     for i, trial in enumerate(arguments.test):
         values = [float(np.asarray(summary[key])[i]) for key in columns.values()]
-        print(
-            f"{trial:<10}{values[0]:>12.3f}{values[1]:>10.3f}{values[2]:>10.3f}"
-            f"{checks[i].nis:>8.2f}{checks[i].nees:>8.2f}"
-        )
+        values += [checks[i].nis, checks[i].nees]
+        print(f"{trial:>12}" + "".join(f"{value:>12.3f}" for value in values))
     summary["trials"] = arguments.test
     summary["seconds"] = round(time.perf_counter() - began, 1)
     print(json.dumps(summary))

@@ -45,8 +45,9 @@ def estimate(
 
     `model` is a name, ``module:attribute`` or a `Model`; `params` are the model's defaults unless
     given (see `jaxekf.load_parameters`). Each instant is estimated from what was measured until then
-    or, with `smooth`, from the whole run; innovations are those of the filter in both cases. Raises `RecordingError` for what is wrong with the data,
-    `FilterError` where the recursion broke, `PrecisionError` in float32.
+    or, with `smooth`, from the whole run; innovations are those of the filter in both cases. Raises
+    `RecordingError` for what is wrong with the data, `FilterError` where the recursion broke,
+    `PrecisionError` in float32.
     """
     return estimate_many([run], model, params, smooth=smooth)[0]
 

@@ -115,6 +115,7 @@ def test_example_on_whole_trials(folder):
     tuned, initial, held = (np.mean(last[k]) for k in ("tuned_deg", "initial_deg", "hold_last_deg"))
     assert tuned <= 0.9 * initial
     assert tuned <= 0.05 * held
+    assert np.mean(last["smoothed_deg"]) <= 0.95 * tuned
 
 
 def test_faults_are_named(tmp_path):

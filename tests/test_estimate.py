@@ -54,6 +54,28 @@ def test_unequal_lengths_and_buckets():
         np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9, atol=1e-18)
 
 
+def test_smooth(tmp_path):
+    """A smoother that is handed padding, another run's beliefs or a filter's outputs; a result that does
+    not say which it is."""
+    records = [record(seed, 2.0 + 0.3 * seed, occlusions=[(1.0, 1.4)]) for seed in range(1, 4)]
+    filtered = jaxekf.estimate_many(records)
+    smoothed = jaxekf.estimate_many(records, smooth=True)
+    for before, after, r in zip(filtered, smoothed, records, strict=True):
+        np.testing.assert_allclose(after.cov[-1], before.cov[-1], rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(after.attitude.value[-1], before.attitude.value[-1], atol=1e-12)
+        assert after.log_likelihood == pytest.approx(before.log_likelihood, rel=1e-9)
+        hidden = (after.time > 1.05) & (after.time < 1.35)
+        assert np.all(after.attitude.sigma[hidden] < 0.95 * before.attitude.sigma[hidden])
+        assert np.all(after.bias.sigma <= before.bias.sigma * (1.0 + 1e-9))
+        rmse = metrics.score(after, r).attitude_rmse_deg
+        assert rmse < 0.9 * metrics.score(before, r).attitude_rmse_deg
+    alone = jaxekf.estimate(records[0], smooth=True)
+    np.testing.assert_allclose(alone.cov, smoothed[0].cov, rtol=1e-9, atol=1e-15)
+    assert alone.smoothed and not filtered[0].smoothed
+    assert any("whole run" in note for note in alone.notes)
+    assert '"smoothed": true' in (alone.save(tmp_path / "r") / "result.json").read_text()
+
+
 @pytest.mark.parametrize("count", [1, 4, 5, 9, 1000, 1025])
 def test_buckets_waste_little(count):
     """Would catch buckets that are too small or too coarse."""

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf import algebra, linalg, patterned
+from jaxekf import algebra, linalg, patterned, recursion
 from jaxekf.algebra import Gained, Rows, Solved
 from jaxekf.kernels import loop
 from jaxekf.lanes import written_sum
@@ -61,17 +61,17 @@ def scan_back(
     dtype = first.belief.cov.dtype
     nothing = Information(jnp.zeros((size, lanes), dtype), jnp.zeros((size, size, lanes), dtype))
     start = begin(system, *first)
-    before = jax.tree.map(partial(_one_earlier), start.belief.mean, filtered.updated.mean)
+    before = jax.tree.map(one_earlier, start.belief.mean, filtered.updated.mean)
     refused = None
     if start.refused is not None and filtered.refused is not None:
-        refused = _one_earlier(start.refused, filtered.refused)
+        refused = one_earlier(start.refused, filtered.refused)
     epoch = partial(_epoch, system, adjoint, prepared)
     every = _Instant(given.moments, before, refused, filtered)
     info, found = lax.scan(epoch, nothing, (every, given.fast, given.slow), reverse=True)
     return found, smoothed(system, prepared, first.belief, info, adjoint=adjoint)
 
 
-def _one_earlier(first: Array, every: Array) -> Array:
+def one_earlier(first: Array, every: Array) -> Array:
     """The values (K, S, ...) at the end of each substep before: `first` is that of the start."""
     flat = every.reshape(-1, *every.shape[2:])
     return jnp.concatenate([first[None], flat[:-1]]).reshape(every.shape)
@@ -89,14 +89,7 @@ def _epoch(
         info = _before_update(system, prepared, info, instant, samples, adjoint)
         return _before_prediction(system, prepared, info, instant, adjoint), belief
 
-    last, fast_last = jax.tree.map(lambda a: a[-1], (every, fast))
-    info, ended = substep(info, (last, fast_last | slow))
-    ended = jax.tree.map(lambda a: a[None], ended)
-    if every.moment.dt.shape[0] == 1:
-        return info, ended
-    rest = jax.tree.map(lambda a: a[:-1], (every, fast))
-    info, earlier = lax.scan(substep, info, rest, reverse=True)
-    return info, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), earlier, ended)
+    return recursion.over_substeps_back(substep, info, (every, fast), slow)
 
 
 def smoothed(
@@ -126,10 +119,10 @@ def _before_prediction(
     found = transition.piece(
         prepared["transition"], instant.before, moment.u, moment.dt, adjoint=adjoint
     )
-    return _carried(transition.state, found[1], info)
+    return carried(transition.state, found[1], info)
 
 
-def _carried(p: Pattern, block: Array | None, info: Information) -> Information:
+def carried(p: Pattern, block: Array | None, info: Information) -> Information:
     """``M' a`` and ``M' L M``."""
     back, turned = p.transposed, patterned.transpose(block)
     vector = loop(partial(patterned.multiply, back), turned, info.vector)
@@ -152,7 +145,7 @@ def _before_update(
     linear, cov, _ = look(system, prepared, ahead, instant.moment.u, samples, adjoint=adjoint)
     gained = Gained(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
     taken = []
-    for slope, rows in blocks_of_rows(system, linear):
+    for slope, rows in blocks_of_rows(system.measurements, linear):
         gained, _, solved = algebra.take(slope, gained, rows, with_inverse=True)
         taken.append((slope, rows, solved))
     correction = system.correction
@@ -165,13 +158,13 @@ def _before_update(
         vector = info.vector + loop(algebra.apply, info.matrix, shift)
         info = info._replace(vector=vector)
     if not correction.reset.is_identity:
-        info = _carried(correction.reset, reset, info)
+        info = carried(correction.reset, reset, info)
     for slope, rows, solved in reversed(taken):
-        info = _before_rows(slope, rows, solved, info)
+        info = before_rows(slope, rows, solved, info)
     return info
 
 
-def _before_rows(p: Pattern, rows: Rows, found: Solved, info: Information) -> Information:
+def before_rows(p: Pattern, rows: Rows, found: Solved, info: Information) -> Information:
     """``A' a + H' inv(S) e`` and ``A' L A + H' inv(S) H`` with ``A = I - K H``."""
     size, back, turned = p.shape[1], p.transposed, patterned.transpose(rows.slope)
     gain = [row[:size] for row in found.solved]

@@ -176,14 +176,14 @@ def made_ready(
             " each; leave out runs without data"
         )
     inputs = jax.vmap(partial(inputs_of, model))(params, steps)
-    sizes: Any = _one_sample((params, belief.mean), 1)
-    u, fast = _one_sample((inputs, steps.fast), 3)
-    ready = system.build(model, sizes[0], sizes[1], u, fast | _one_sample(steps.slow, 2))
+    sizes: Any = one_sample((params, belief.mean), 1)
+    u, fast = one_sample((inputs, steps.fast), 3)
+    ready = system.build(model, sizes[0], sizes[1], u, fast | one_sample(steps.slow, 2))
     prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
     return ready, prepared, Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
 
 
-def _one_sample(tree: Any, axes: int) -> Any:
+def one_sample(tree: Any, axes: int) -> Any:
     """Shape and type of one sample of arrays with `axes` leading axes."""
     return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[axes:], a.dtype), tree)
 

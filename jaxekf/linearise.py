@@ -130,3 +130,38 @@ def _neutral(space: Any, value: Any, mask: Array, predicted: Any) -> Any:
         single = rows if part.manifold.shape == (part.manifold.dim,) else jnp.any(rows)
         clean.append(jnp.where(single, seen, expected))
     return jax.tree.unflatten(structure, clean)
+
+
+def linearise_between(
+    model: Model, params: Parameters, x: Any, after: Any, w: Array, u: Any, dt: Array
+) -> tuple[Array, Array, Array]:
+    """How far the transition from ``x`` with process noise ``w`` misses ``after``, for one run.
+
+    The error vector (n,) counted from ``after``, and its Jacobians F (n, n) and G (n, n_w) by the error of
+    ``x`` and by ``w``: exact, whatever the distance.
+    """
+
+    def missed(delta: Array, w: Array) -> Array:
+        moved = model.transition(manifold.retract(model.space, x, delta), u, dt, w, params)
+        return manifold.local(model.space, after, moved)
+
+    here = jnp.zeros(model.error_dim, manifold.dtype_of(x))
+    f, g = jax.jacfwd(missed, (0, 1))(here, w)
+    return missed(here, w), f, g
+
+
+def linearise_residual(
+    model: Model, sensor: Sensor, params: Parameters, x: Any, u: Any, rows: Rows
+) -> tuple[Array, Array, Array]:
+    """As `linearise_sensor`, but with the Jacobian of the residual itself, its sign turned: where a
+    sample is curved the two differ by how far it is away."""
+
+    def residual(delta: Array) -> Array:
+        expected = sensor.predict(manifold.retract(model.space, x, delta), u, params, rows.aux)
+        value = _neutral(sensor.space, rows.value, rows.mask, expected)
+        found = manifold.local(sensor.space, expected, value)
+        return jnp.where(rows.mask, found, 0.0)
+
+    here = jnp.zeros(model.error_dim, manifold.dtype_of(x))
+    slope = -jax.jacfwd(residual)(here)
+    return residual(here), slope, sensor.noise(params, rows.aux, rows.dt)

@@ -118,7 +118,7 @@ def update(
         return Outcome(prior, ahead, nothing, sound, used, gates.gated, never)
     gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
-    for slope, rows in blocks_of_rows(system, linear):
+    for slope, rows in blocks_of_rows(system.measurements, linear):
         gained, pivot = _take(slope, gained, rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
     posterior = _correct(
@@ -147,7 +147,7 @@ def look(
         constants = prepared[f"sensor {name}"]
         found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
         residual, slope, noise = found
-        seen[name] = _hide(measurement, residual, slope, noise, sample.mask)
+        seen[name] = hide(measurement, residual, slope, noise, sample.mask)
     gates = _gates(system, seen, samples, ahead)
     linear = {name: _without(one, gates.gated[name]) for name, one in seen.items()}
     cov = prior.cov if gates.widened is None else prior.cov * gates.widened[None, None]
@@ -169,7 +169,7 @@ def _congruence(p: Pattern, block: Array | None, cov: Array, adjoint: bool) -> A
     return algebra.congruence(p, block, cov)[0]
 
 
-def _hide(
+def hide(
     measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
 ) -> Linear:
     """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
@@ -257,7 +257,9 @@ def _take(
     return algebra.update(slope, gained, rows)
 
 
-def blocks_of_rows(system: System, linear: dict[str, Linear]) -> list[tuple[Pattern, algebra.Rows]]:
+def blocks_of_rows(
+    measurements: dict[str, Measurement], linear: dict[str, Linear]
+) -> list[tuple[Pattern, algebra.Rows]]:
     """Rows in blocks that are taken at once: whole sensors together while they are small."""
     groups: list[list[str]] = []
     size = 0
@@ -269,10 +271,12 @@ def blocks_of_rows(system: System, linear: dict[str, Linear]) -> list[tuple[Patt
         else:
             groups.append([name])
             size = rows
-    return [_joined(system, [linear[name] for name in names], names) for names in groups]
+    return [_joined(measurements, [linear[name] for name in names], names) for names in groups]
 
 
-def _joined(system: System, parts: list[Linear], names: list[str]) -> tuple[Pattern, algebra.Rows]:
+def _joined(
+    measurements: dict[str, Measurement], parts: list[Linear], names: list[str]
+) -> tuple[Pattern, algebra.Rows]:
     """Rows of several sensors as one block."""
     if len(parts) == 1:
         return parts[0].slope, parts[0].rows
@@ -285,7 +289,7 @@ def _joined(system: System, parts: list[Linear], names: list[str]) -> tuple[Patt
         whole = [patterned.dense(p.slope, p.rows.slope, lanes, dtype) for p in parts]
         stacked = patterned.take(jnp.concatenate(whole), slope.rows, 0)
         unknown = patterned.take(stacked, slope.cols, 1)
-    if all(system.measurements[name].diagonal for name in names):
+    if all(measurements[name].diagonal for name in names):
         noise = jnp.concatenate([part.rows.noise for part in parts])
     else:
         noise = _block_diagonal([part.rows.noise for part in parts])

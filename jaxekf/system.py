@@ -171,11 +171,13 @@ class System:
 
 def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:
     """The system of a model for one sample of everything: arrays, or their shapes and types."""
-    spec = jax.tree.map(
-        lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), (params, x, u, rows)
-    )
-    leaves, tree = jax.tree.flatten(spec)
-    return _build(model, tuple((leaf.shape, leaf.dtype) for leaf in leaves), tree)
+    return _build(model, *specified(params, x, u, rows))
+
+
+def specified(*args: Any) -> tuple[Any, Any]:
+    """Shapes and types of the leaves of the arguments, and their structure; hashable."""
+    leaves, tree = jax.tree.flatten(args)
+    return tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves), tree
 
 
 @lru_cache(maxsize=64)
@@ -183,7 +185,7 @@ def _build(model: Model, leaves: Any, tree: Any) -> System:
     spec = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
     params, x, u, rows = spec
     measurements = {
-        name: _measurement(model, model.sensor(name), params, x, u, sample)
+        name: measurement(model, model.sensor(name), params, x, u, sample)
         for name, sample in rows.items()
     }
     return System(
@@ -191,11 +193,18 @@ def _build(model: Model, leaves: Any, tree: Any) -> System:
     )
 
 
-def _known(function: Callable[..., Any], *args: Any) -> Any:
+def cut(matrix: Array, p: Pattern) -> Array | None:
+    """The unknown block of a whole matrix."""
+    if not p.rows:
+        return None
+    return patterned.take(patterned.take(matrix, p.rows, 0), p.cols, 1)
+
+
+def known(function: Callable[..., Any], *args: Any) -> Any:
     return structure.find(programs.trace(function, *args))
 
 
-def _is_diagonal(matrix: structure.Known) -> bool:
+def is_diagonal(matrix: structure.Known) -> bool:
     return bool(np.all(matrix.is_zero() | np.eye(matrix.value.shape[0], dtype=bool)))
 
 
@@ -206,10 +215,10 @@ def _unknown_block(jacobian: Array, p: Pattern) -> Array | None:
 
 def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
-    whole = _known(partial(linearise.linearise_transition, model), params, x, u, dt)
+    whole = known(partial(linearise.linearise_transition, model), params, x, u, dt)
     state, noise = patterned.pattern(whole[1]), patterned.pattern(whole[2])
-    sigma = _known(model.process_noise, params, dt)
-    diagonal = _is_diagonal(sigma)
+    sigma = known(model.process_noise, params, dt)
+    diagonal = is_diagonal(sigma)
 
     def step(params: Any, x: Any, u: Any, dt: Array) -> Any:
         predicted, f, g = linearise.linearise_transition(
@@ -222,19 +231,25 @@ def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     return Transition(Piece(step, params, x, u, dt), state, noise, diagonal)
 
 
-def _measurement(
-    model: Model, sensor: Sensor, params: Any, x: Any, u: Any, rows: Any
+def measurement(
+    model: Model,
+    sensor: Sensor,
+    params: Any,
+    x: Any,
+    u: Any,
+    rows: Any,
+    linearised: Callable[..., Any] = linearise.linearise_sensor,
 ) -> Measurement:
-    whole = _known(partial(linearise.linearise_sensor, model, sensor), params, x, u, rows)
+    function = partial(linearised, model, sensor)
+    whole = known(function, params, x, u, rows)
     slope = patterned.pattern(whole[1])
-    diagonal = _is_diagonal(whole[2])
+    diagonal = is_diagonal(whole[2])
+    few = {"columns": slope.cols} if linearised is linearise.linearise_sensor else {}
 
     def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
-        residual, h, noise = linearise.linearise_sensor(
-            model, sensor, params, x, u, rows, slope.cols
-        )
+        residual, h, noise = function(params, x, u, rows, **few)
         noise = linalg.diagonal(noise) if diagonal else noise
-        return residual, _unknown_block(h, slope), noise
+        return residual, _unknown_block(h, slope) if few else cut(h, slope), noise
 
     piece = Piece(sample, params, x, u, rows)
     return Measurement(sensor, piece, slope, diagonal)
@@ -243,7 +258,7 @@ def _measurement(
 def _correction(model: Model, params: Any, x: Any) -> Correction:
     delta = jax.ShapeDtypeStruct((model.error_dim,), manifold.dtype_of(x))
     used = jax.ShapeDtypeStruct((), jnp.bool_)
-    reset = patterned.pattern(_known(partial(manifold.reset_jacobian, model.space), delta))
+    reset = patterned.pattern(known(partial(manifold.reset_jacobian, model.space), delta))
 
     def move(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
         moved = manifold.retract(model.space, x, delta)
@@ -254,8 +269,7 @@ def _correction(model: Model, params: Any, x: Any) -> Correction:
             shift = jnp.where(any_used, shift, 0.0)
         mean = manifold.copy_where(any_used, mean, x)
         if reset.rows:
-            jacobian = manifold.reset_jacobian(model.space, delta)
-            block = patterned.take(patterned.take(jacobian, reset.rows, 0), reset.cols, 1)
+            block = cut(manifold.reset_jacobian(model.space, delta), reset)
         return mean, block, shift
 
     return Correction(Piece(move, params, x, delta, used), reset)

@@ -1,0 +1,110 @@
+"""A model made ready for steps that are linearised about a path that is given, exactly.
+
+The filter linearises at its own estimates, in charts where it stands; whoever minimises over a whole run
+linearises everything about one path, and needs the derivatives of the residuals themselves.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+from jax import Array
+
+from jaxekf import linalg, linearise, manifold, patterned
+from jaxekf.model import Model
+from jaxekf.system import (
+    Measurement,
+    Piece,
+    Transition,
+    cut,
+    is_diagonal,
+    known,
+    measurement,
+    specified,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class AboutSystem:
+    """A model made ready for steps that are linearised about a given path instead of the filter's own."""
+
+    model: Model
+    transition: Transition
+    """Its piece is ``(params, x, after, w, u, dt)`` to how far ``after`` is missed, the unknown blocks of
+    F and G, and the noise."""
+    measurements: dict[str, Measurement]
+    start: Piece
+    """``(params, first, x)`` to the error of ``x`` counted from ``first``, and the derivative of one
+    counted from ``x`` by it."""
+    move: Piece
+    """``(params, x, delta)`` to ``x`` moved and the reset Jacobian."""
+
+    def prepare(self, params: Any) -> dict[str, tuple[Array, ...]]:
+        """What the steps need of the parameters, for one run."""
+        found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
+        for name, piece in self._pieces().items():
+            found[name] = piece.prepare(params)
+        return found
+
+    def _pieces(self) -> dict[str, Piece]:
+        return {"transition": self.transition.piece, "start": self.start, "move": self.move}
+
+    @property
+    def is_plain(self) -> bool:
+        """As `System.is_plain`."""
+        pieces = [m.piece for m in self.measurements.values()]
+        return all(p.is_plain for p in [*pieces, *self._pieces().values()])
+
+
+def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> AboutSystem:
+    """As `system.build`."""
+    return _build(model, *specified(params, x, u, rows))
+
+
+@lru_cache(maxsize=64)
+def _build(model: Model, leaves: Any, tree: Any) -> AboutSystem:
+    spec = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    params, x, u, rows = spec
+    dtype = manifold.dtype_of(x)
+    delta = jax.ShapeDtypeStruct((model.error_dim,), dtype)
+
+    def start(params: Any, first: Any, x: Any) -> Any:
+        away = manifold.local(model.space, first, x)
+        return away, manifold.reset_jacobian(model.space, away)
+
+    def move(params: Any, x: Any, delta: Array) -> Any:
+        moved = manifold.retract(model.space, x, delta)
+        if model.project is not None:
+            moved = model.project(moved)
+        return moved, manifold.reset_jacobian(model.space, delta)
+
+    return AboutSystem(
+        model,
+        _transition(model, params, x, u),
+        {
+            name: measurement(
+                model, model.sensor(name), params, x, u, sample, linearise.linearise_residual
+            )
+            for name, sample in rows.items()
+        },
+        Piece(start, params, x, x),
+        Piece(move, params, x, delta),
+    )
+
+
+def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
+    dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
+    sigma = known(model.process_noise, params, dt)
+    w = jax.ShapeDtypeStruct(sigma.value.shape[:1], dt.dtype)
+    whole = known(partial(linearise.linearise_between, model), params, x, x, w, u, dt)
+    state, noise = patterned.pattern(whole[1]), patterned.pattern(whole[2])
+    diagonal = is_diagonal(sigma)
+
+    def step(params: Any, x: Any, after: Any, w: Array, u: Any, dt: Array) -> Any:
+        missed, f, g = linearise.linearise_between(model, params, x, after, w, u, dt)
+        sigma = model.process_noise(params, dt)
+        sigma = linalg.diagonal(sigma) if diagonal else sigma
+        return missed, cut(f, state), cut(g, noise), sigma
+
+    return Transition(Piece(step, params, x, x, w, u, dt), state, noise, diagonal)

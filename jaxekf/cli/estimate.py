@@ -103,20 +103,28 @@ def estimate(
     if as_json:
         print_json({"model": chosen.name, "runs": summaries})
         return
-    rows = [_row(summary) for summary in summaries]
-    columns = [
-        "run",
-        "seconds",
-        "attitude RMSE\n(deg)",
-        "rate RMSE\n(deg/s)",
-        "NEES",
-        "tracker\nNIS",
-        "tracker rows\nused",
-    ]
-    print_table(f"Estimates by {chosen.name}", columns, rows)
+    _print_estimates(f"Estimates by {chosen.name}", summaries)
 
 
-def _row(summary: dict[str, Any]) -> list[Any]:
+def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
+    """One row a run; columns of position only where some run's can be judged."""
+    columns = ["run", "seconds"]
+    scores = {
+        "attitude_rmse_deg": "attitude RMSE\n(deg)",
+        "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
+        "attitude_nees": "NEES",
+    }
+    placed = [summary["score"]["position_rmse_mm"] for summary in summaries if "score" in summary]
+    if any(value == value for value in placed):
+        scores |= {
+            "position_rmse_mm": "position RMSE\n(mm)",
+            "position_nees": "position\nNEES",
+        }
+    columns += [*scores.values(), "tracker\nNIS", "tracker rows\nused"]
+    print_table(title, columns, [_row(summary, tuple(scores)) for summary in summaries])
+
+
+def _row(summary: dict[str, Any], scores: tuple[str, ...]) -> list[Any]:
     judged = summary.get("score", {})
     nan = float("nan")
     trackers = [n for n in summary["account"] if n == "optical" or n.startswith("marker_")]
@@ -125,9 +133,7 @@ def _row(summary: dict[str, Any]) -> list[Any]:
     return [
         summary["run"],
         summary["duration_s"],
-        judged.get("attitude_rmse_deg", nan),
-        judged.get("rate_rmse_deg_s", nan),
-        judged.get("attitude_nees", nan),
+        *(judged.get(name, nan) for name in scores),
         sum(known) / len(known) if known else nan,
         f"{used} of {read}",
     ]

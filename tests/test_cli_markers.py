@@ -1,0 +1,113 @@
+"""The command line on runs of single markers: scores of the position, what was known live, refusals."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import jaxekf
+from jaxekf import simulate_tool
+from jaxekf.cli import main
+from jaxekf.cli.tune import print_comparison
+from jaxekf.datasets import demo
+from jaxekf.simulate_tool import ToolGrade
+from tuning import Row
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short recording on disk, one marker hidden for a while."""
+    recording = simulate_tool.tool_recording(
+        "tool",
+        simulate_tool.free_tool_motion(1),
+        seed=1,
+        duration_s=2.0,
+        grade=ToolGrade(imu_s=0.006),
+        hidden=[("2", 1.0, 1.5)],
+    )
+    return jaxekf.save(recording, tmp_path_factory.mktemp("markers") / "tool")
+
+
+@pytest.fixture(scope="module")
+def result(run, tmp_path_factory):
+    """What `estimate --model tight` prints and writes."""
+    output = tmp_path_factory.mktemp("result")
+    done = call("estimate", run, "--model", "tight", "-o", output, "--json")
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)["runs"][0]
+
+
+def columns(folder):
+    """The columns of a result's `estimate.csv` by name."""
+    return np.genfromtxt(folder + "/estimate.csv", delimiter=",", names=True)
+
+
+def truth_at(run, time):
+    """True positions (N, 3) at the estimate's instants, which are some of the encoder's."""
+    encoder = jaxekf.load(run).encoder
+    seconds = encoder.time_ns / 1e9
+    at = np.searchsorted(seconds, time - 1e-6)
+    np.testing.assert_allclose(seconds[at], time, atol=1e-6)
+    return encoder.position[at]
+
+
+def test_position_is_scored(run, result):
+    """Would catch a position's error in metres, of one axis, or measured with the wrong covariance."""
+    table, judged = columns(result["result"]), result["score"]
+    estimated = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
+    error = truth_at(run, table["time"]) - estimated
+    expected = 1e3 * np.sqrt(np.mean(np.sum(error**2, axis=1)))
+    assert judged["position_rmse_mm"] == pytest.approx(expected, rel=1e-6)
+    cov = np.load(result["result"] + "/covariance.npz")["cov_position"]
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 3.0
+    assert judged["position_nees"] == pytest.approx(nees, rel=1e-6)
+    assert 0.1 < nees < 10.0
+
+
+def test_blank_true_positions_do_not_count(run, result):
+    """Would catch a score that is lost in one blank cell, or an unknown position that counts as zero."""
+    recording = jaxekf.load(run)
+    made = jaxekf.estimate(recording, "tight")
+    position = recording.encoder.position.copy()
+    position[100:150] = np.nan
+    blank = replace(recording.encoder, position=position)
+    got = jaxekf.score(made, recording.replace(encoder=blank))
+    at = np.searchsorted(blank.time_ns, made.time_ns)
+    error = (position[at] - made.outputs["position"].value)[np.isfinite(position[at, 0])]
+    expected = 1e3 * np.sqrt(np.mean(np.sum(error**2, axis=1)))
+    assert got.position_rmse_mm == pytest.approx(expected, rel=1e-9)
+    assert got.samples == result["score"]["samples"]
+    unknown = jaxekf.score(made, recording.replace(encoder=replace(blank, position=None)))
+    assert np.isnan(unknown.position_rmse_mm)
+    assert np.isnan(unknown.position_nees)
+    assert unknown.attitude_rmse_deg == got.attitude_rmse_deg
+
+
+def test_position_is_shown_where_there_is_one(run, tmp_path):
+    """Would catch a column of dashes for models without position, or none for those with it."""
+    shown = call("estimate", run, "--model", "tight", "-o", tmp_path / "tight")
+    assert "position RMSE" in shown.stdout
+    plain = call("estimate", demo.FOLDER / "free-5", "-o", tmp_path / "loose", "--json")
+    assert json.loads(plain.stdout)["runs"][0]["score"]["position_rmse_mm"] is None
+    table = call("estimate", demo.FOLDER / "free-5", "-o", tmp_path / "loose", "--overwrite")
+    assert table.exit_code == 0, table.output
+    assert "position" not in table.stdout
+
+
+def test_position_is_compared_where_there_is_one(capsys):
+    """Would catch a comparison without position, its column for attitude alone, or a mean that is lost
+    in one run without truth."""
+    loose = [Row("a", "tuned", 0.1, 1.0, 1.0, 1.0)]
+    print_comparison("compared", loose)
+    assert "position" not in capsys.readouterr().out
+    print_comparison("compared", [*loose, Row("b", "tuned", 0.1, 1.0, 1.0, 1.0, 0.25, 1.5)])
+    lines = capsys.readouterr().out.splitlines()
+    assert any("position RMSE" in line for line in lines)
+    mean = next(line for line in lines if "mean" in line)
+    assert mean.split()[-2:] == ["0.250", "1.500"]

@@ -111,3 +111,40 @@ def test_position_is_compared_where_there_is_one(capsys):
     assert any("position RMSE" in line for line in lines)
     mean = next(line for line in lines if "mean" in line)
     assert mean.split()[-2:] == ["0.250", "1.500"]
+
+
+def test_online_is_what_was_known(run, result, tmp_path):
+    """Would catch --online that does nothing, or that looks ahead: with the tracker 34 ms late a live
+    system starts later and is worse."""
+    done = call("estimate", run, "--model", "tight", "--online", "-o", tmp_path, "--json")
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    told = document["runs"][0]
+    assert document["online"] is True
+    assert any("34 ms late" in note for note in told["notes"])
+    online = jaxekf.estimate_online(run, "tight")
+    table = columns(told["result"])
+    np.testing.assert_allclose(
+        table["position_x"], online.outputs["position"].value[:, 0], atol=1e-9
+    )
+    # The first sample of the IMU, every 6 ms, by which the first frame has arrived.
+    assert table["time"][0] - columns(result["result"])["time"][0] == pytest.approx(0.036, abs=1e-6)
+    assert told["score"]["position_rmse_mm"] > 1.1 * result["score"]["position_rmse_mm"]
+
+
+def test_online_of_a_model_that_only_looks_back(tmp_path):
+    """Would catch a stack trace, a refusal after the work was done, or one that names no other model."""
+    done = call(
+        "estimate",
+        demo.FOLDER / "free-5",
+        "--model",
+        "loose_rate",
+        "--online",
+        "-o",
+        tmp_path / "o",
+    )
+    assert done.exit_code == 1
+    assert len(done.output.strip().splitlines()) == 1
+    for words in ("'loose_rate' without input", "loose, loose_pose, tight", "not online"):
+        assert words in done.output
+    assert not (tmp_path / "o").exists()

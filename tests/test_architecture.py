@@ -38,7 +38,7 @@ ORDER = [
     ("datasets.columns",),
     ("datasets", "datasets.asl", "datasets.broad", "datasets.demo"),
     ("plots",),
-    ("cli.console", "cli.machine"),
+    ("cli.console", "cli.machine", "cli.options"),
     ("cli.simulate", "cli.estimate"),
     ("cli.plot", "cli.tune"),
     ("cli.demo",),

@@ -2,17 +2,17 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import jaxekf
-from jaxekf import simulate_tool
+from jaxekf import pose
 from jaxekf.cli import main
 from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo
-from jaxekf.simulate_tool import ToolGrade
 from tuning import Row
 
 
@@ -22,16 +22,43 @@ def call(*arguments):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A short recording on disk, one marker hidden for a while."""
-    recording = simulate_tool.tool_recording(
+    """A short recording on disk: one marker hidden for a while, then all."""
+    done = call(
+        "simulate",
+        "--motion",
         "tool",
-        simulate_tool.free_tool_motion(1),
-        seed=1,
-        duration_s=2.0,
-        grade=ToolGrade(imu_s=0.006),
-        hidden=[("2", 1.0, 1.5)],
+        "--seed",
+        1,
+        "--duration",
+        2,
+        "--hide",
+        "1,1.3,2",
+        "--hide",
+        "1.5,1.6",
+        "--latency",
+        0.025,
+        "-o",
+        tmp_path_factory.mktemp("markers"),
+        "--json",
     )
-    return jaxekf.save(recording, tmp_path_factory.mktemp("markers") / "tool")
+    assert done.exit_code == 0, done.output
+    return Path(json.loads(done.stdout)["runs"][0])
+
+
+def test_simulated_tool_is_as_asked(run):
+    """Would catch options that do nothing, the wrong marker hidden, or a noise of another size."""
+    recording = jaxekf.load(run)
+    markers = recording.need_markers()
+    assert (recording.name, recording.optical) == ("tool-1", None)
+    assert markers.latency_ns == 25_000_000
+    taken = (markers.time_ns - markers.latency_ns) / 1e9
+    one, every = (taken >= 1.0) & (taken < 1.3), (taken >= 1.5) & (taken < 1.6)
+    hidden = np.stack([every, one | every, every], axis=1)
+    np.testing.assert_array_equal(markers.visible, ~hidden)
+    raw, truth = pose.from_markers(markers), recording.need_encoder()
+    at = np.searchsorted(truth.time_ns, raw.time_ns - raw.latency_ns)
+    corner = markers.position[:, 0] - truth.position[at]
+    assert 1e3 * np.nanstd(corner) == pytest.approx(0.231, rel=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -114,21 +141,21 @@ def test_position_is_compared_where_there_is_one(capsys):
 
 
 def test_online_is_what_was_known(run, result, tmp_path):
-    """Would catch --online that does nothing, or that looks ahead: with the tracker 34 ms late a live
+    """Would catch --online that does nothing, or that looks ahead: with the tracker 25 ms late a live
     system starts later and is worse."""
     done = call("estimate", run, "--model", "tight", "--online", "-o", tmp_path, "--json")
     assert done.exit_code == 0, done.output
     document = json.loads(done.stdout)
     told = document["runs"][0]
     assert document["online"] is True
-    assert any("34 ms late" in note for note in told["notes"])
+    assert any("25 ms late" in note for note in told["notes"])
     online = jaxekf.estimate_online(run, "tight")
     table = columns(told["result"])
     np.testing.assert_allclose(
         table["position_x"], online.outputs["position"].value[:, 0], atol=1e-9
     )
-    # The first sample of the IMU, every 6 ms, by which the first frame has arrived.
-    assert table["time"][0] - columns(result["result"])["time"][0] == pytest.approx(0.036, abs=1e-6)
+    # The first sample of the IMU, every 2 ms, by which the first frame has arrived.
+    assert table["time"][0] - columns(result["result"])["time"][0] == pytest.approx(0.026, abs=1e-6)
     assert told["score"]["position_rmse_mm"] > 1.1 * result["score"]["position_rmse_mm"]
 
 
@@ -162,3 +189,22 @@ def test_the_wrong_model_names_the_right_one(run, tmp_path, command):
     assert back.exit_code == 1
     assert len(back.output.strip().splitlines()) == 1
     assert "loose_pose" in back.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--motion", "tool", "--occlusion", "1,2"], "--hide"),
+        (["--motion", "tool", "--optical-noise", "1"], "--optical-noise with --motion tool"),
+        (["--hide", "1,2"], "--hide with --motion free"),
+        (["--motion", "tool", "--hide", "1,2,7"], "marker '7'"),
+        (["--motion", "tool", "--hide", "2,1,1"], "START < END"),
+        (["--motion", "tool", "--latency", "nan"], "expected a number"),
+    ],
+)
+def test_simulate_refuses_what_a_motion_has_no_use_for(arguments, words, tmp_path):
+    """Would catch an option that is passed over in silence, or a marker that is not there."""
+    done = call("simulate", *arguments, "-o", tmp_path / "runs")
+    assert done.exit_code == 2
+    assert words in " ".join(done.output.split())
+    assert not (tmp_path / "runs").exists()

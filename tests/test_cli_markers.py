@@ -177,6 +177,17 @@ def test_online_of_a_model_that_only_looks_back(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+def test_plot_draws_single_markers(run, tmp_path):
+    """Would catch a command that writes no figure and says nothing."""
+    done = call("plot", run, "--model", "tight", "--figure", "visibility", "-o", tmp_path, "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["figures"] == [str(tmp_path / "tool-1_visibility.png")]
+    wrong = call("plot", demo.FOLDER / "free-5", "--figure", "visibility", "-o", tmp_path)
+    assert wrong.exit_code == 1
+    assert "attitude" in wrong.output
+    assert len(wrong.output.strip().splitlines()) == 1
+
+
 @pytest.mark.parametrize("command", ["estimate", "plot", "tune"])
 def test_the_wrong_model_names_the_right_one(run, tmp_path, command):
     """Would catch a user of single markers told to add a file that the tracker does not write."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxekf
-from jaxekf import plots, simulate_tool
+from jaxekf import plots, pose, simulate_tool
 from jaxekf.plots import attitudes, sight, single_markers
 from jaxekf.recording import Encoder, Optical
 from jaxekf.simulate_tool import ToolGrade
@@ -102,6 +102,23 @@ def test_markers_stand_where_they_were_taken(figures, name, unit):
         assert np.median(np.abs(error)) < 0.5 * unit
     assert t[0] == 0.0
     assert not ((t > 1.5) & (t < 2.25)).any()
+
+
+def test_what_is_missing_is_left_out(made, tmp_path):
+    """Would catch limits that are not numbers: of a tracker's pose without position, of a marker that was
+    never seen, of an encoder without positions."""
+    estimate, recording = made
+    raw = pose.from_markers(recording.markers)
+    tracker = replace(raw, position=np.full_like(raw.position, np.nan))
+    encoder = replace(recording.encoder, position=None)
+    never = estimate.sensors["marker_2"]
+    never = type(never)(*(getattr(never, field)[:0] for field in never.__dataclass_fields__))
+    lacking = replace(estimate, sensors=estimate.sensors | {"marker_2": never})
+    for name in NAMES:
+        figure = plots.figure_functions()[name](
+            lacking, recording.replace(optical=tracker, encoder=encoder)
+        )
+        plots.save(figure, tmp_path / "figure.png")
 
 
 def test_stretches_without_pose(made):

@@ -176,7 +176,9 @@ def _limits(axes: Any, vector: _Vector, i: int) -> None:
     """The range of the curves: a wide band at the start, or a stray sample, must not flatten them."""
     values = vector.value[:, i]
     if vector.measured is not None:
-        values = np.r_[values, np.quantile(vector.measured.value[:, i], [0.005, 0.995])]
+        # A tracker may tell an attitude without a position.
+        known = vector.measured.value[np.isfinite(vector.measured.value[:, i]), i]
+        values = np.r_[values, np.quantile(known, [0.005, 0.995])] if known.size else values
     low, high = values.min(), values.max()
     margin = 0.1 * (high - low) + 1e-9
     axes.set_ylim(low - margin, high + margin)

@@ -134,8 +134,9 @@ def main() -> None:
     if arguments.output is not None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         estimate = jaxekf.estimate(records[0], "loose", parameters("loose"))
-        for name, draw in plots.figure_functions().items():
-            plots.save(draw(estimate, records[0]), arguments.output / f"{name}.png")
+        for name in plots.possible_figures(estimate, records[0]):
+            figure = plots.figure_functions()[name](estimate, records[0])
+            plots.save(figure, arguments.output / f"{name}.png")
     summary = {"measurement_deg": raw[0], "measurement_deg_s": raw[1], **table}
     print(json.dumps(summary))
     sys.exit(0 if all(checks.values()) else 1)

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf.recording import (
+    Encoder,
+    Flags,
     Floats,
     Optical,
     Recording,
@@ -23,6 +25,10 @@ class Score(NamedTuple):
     attitude_nees: float
     """Mean normalised estimation error squared by degree of freedom: 1 where honest, above 1 where
     overconfident."""
+    position_rmse_mm: float
+    """Root mean square of the distance to the encoder's position; NaN where either has none."""
+    position_nees: float
+    """As `attitude_nees`, of the position."""
     samples: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -47,21 +53,41 @@ def normalised_square(error: Floats, cov: Floats) -> Floats:
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
 
 
+def mean_nees(error: Floats, cov: Floats) -> float:
+    """Mean of ``e' inv(P) e / d`` over (N, d), (N, d, d); NaN of none."""
+    squared = normalised_square(error, cov)
+    return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
+
+
 def score(estimate: Estimate, recording: Recording, burn_in_s: float = 0.0) -> Score:
-    """Attitude and rate error, and attitude NEES, at those instants of the estimate whose nearest
-    encoder sample is scored; NaN for what the model does not put out."""
+    """Errors of attitude, rate and position, and NEES of attitude and position, at those instants of the
+    estimate whose nearest encoder sample is scored.
+
+    What the model does not put out, or the encoder does not tell, is NaN. Positions are those of the
+    body's origin in the reference frame. Raises `RecordingError` for a run without an encoder.
+    """
     truth = encoder_at(recording.need_encoder(), estimate.time_ns)
     judged = truth.scored & (estimate.time >= burn_in_s)
     attitude = rate = nees = float("nan")
     if "attitude" in estimate.outputs:
         error = attitude_error(estimate.attitude.value[judged], truth.q_ref_body[judged])
         attitude = float(np.rad2deg(rms(error)))
-        squared = normalised_square(error, estimate.attitude.cov[judged])
-        nees = float(np.mean(squared) / 3.0) if squared.size else nees
+        nees = mean_nees(error, estimate.attitude.cov[judged])
     if "rate" in estimate.outputs:
         true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
         rate = float(np.rad2deg(rms(estimate.rate.value[judged] - true_rate)))
-    return Score(attitude, rate, nees, int(judged.sum()))
+    where, where_nees = _position_score(estimate, truth, judged)
+    return Score(attitude, rate, nees, where, where_nees, int(judged.sum()))
+
+
+def _position_score(estimate: Estimate, truth: Encoder, judged: Flags) -> tuple[float, float]:
+    """RMSE in mm and NEES of the position; a blank cell of the encoder's position does not count."""
+    if "position" not in estimate.outputs or truth.position is None:
+        return float("nan"), float("nan")
+    judged = judged & np.isfinite(truth.position).all(axis=1)
+    position = estimate.outputs["position"]
+    error = truth.position[judged] - position.value[judged]
+    return 1e3 * rms(error), mean_nees(error, position.cov[judged])
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:

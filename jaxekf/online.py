@@ -27,6 +27,7 @@ from jaxekf.estimation import (
 )
 from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
+from jaxekf.models import REGISTRY, get_model
 from jaxekf.recording import NANOSECONDS, Times, period_ns
 from jaxekf.result import Estimate
 from jaxekf.timeline import Knots, Steps, Timeline
@@ -116,6 +117,7 @@ def estimate_online(
     a model without input or sensors whose latencies differ (use `Stream`).
     """
     recording = read([run])[0]
+    _need_input(get_model(model))
     made = estimate_many([recording], model, params)[0]
     line = timeline.build(made.model, recording)
     latency = set(line.latency_ns.values())
@@ -141,6 +143,16 @@ def estimate_online(
         outputs=named_outputs(chosen, outputs),
         notes=(*made.notes, f"what was known at each time, measurements {late / 1e6:g} ms late"),
     )
+
+
+def _need_input(model: Model) -> None:
+    """Raise for a model that has nothing to carry it on to the present, before it is run."""
+    if model.input is None:
+        driven = ", ".join(name for name, other in REGISTRY.items() if other.input is not None)
+        raise ModelError(
+            f"got the model '{model.name}' without input, expected one that its input carries on to the"
+            f" present ({driven}); try one of these, or the estimate that is not online"
+        )
 
 
 def _knots(line: Timeline) -> Knots:

@@ -48,8 +48,23 @@ def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1
     if len(encoder.time_ns) < 3:
         return np.full((len(time_ns), 3), np.nan)
     before, after = to_scipy(encoder.q_ref_body[:-2]), to_scipy(encoder.q_ref_body[2:])
-    span = (encoder.time_ns[2:] - encoder.time_ns[:-2])[:, None] / NANOSECONDS
-    rate = (before.inv() * after).as_rotvec() / span
+    return _per_second((before.inv() * after).as_rotvec(), encoder, time_ns, longest_gap_s)
+
+
+def encoder_velocity_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Floats:
+    """Velocity (N, 3), m/s, reference frame, at other times; NaN where the encoder does not tell.
+
+    Central differences of the encoder's position; gaps as in `encoder_rate_at`.
+    """
+    if len(encoder.time_ns) < 3 or encoder.position is None:
+        return np.full((len(time_ns), 3), np.nan)
+    moved = encoder.position[2:] - encoder.position[:-2]
+    return _per_second(moved, encoder, time_ns, longest_gap_s)
+
+
+def _per_second(change: Floats, encoder: Encoder, time_ns: Times, longest_gap_s: float) -> Floats:
+    """Changes (N - 2, 3) over two steps as rates of change at other times."""
+    rate = change / ((encoder.time_ns[2:] - encoder.time_ns[:-2])[:, None] / NANOSECONDS)
     rate[~(encoder.valid[:-2] & encoder.valid[1:-1] & encoder.valid[2:])] = np.nan
     wide = np.diff(encoder.time_ns) > longest_gap_s * NANOSECONDS
     rate[wide[:-1] | wide[1:]] = np.nan

@@ -13,8 +13,17 @@ def made():
     return jaxekf.estimate(record), record
 
 
+LOOSE = ("attitude", "rate", "bias", "occlusion", "path")
+
+
+def test_what_a_model_of_attitude_shows(made):
+    """Would catch a figure of what the model does not have, or one that is left out."""
+    assert plots.possible_figures(*made) == LOOSE
+    assert plots.possible_figures(made[0], made[1].replace(optical=None)) == ()
+
+
 @pytest.mark.parametrize("truth", [True, False])
-@pytest.mark.parametrize("name", plots.figure_functions())
+@pytest.mark.parametrize("name", LOOSE)
 def test_figures_are_drawn(made, tmp_path, name, truth):
     """Would catch a figure that breaks without an encoder, or lacks units, legend or band."""
     estimate, record = made
@@ -26,9 +35,8 @@ def test_figures_are_drawn(made, tmp_path, name, truth):
     axes = figure.axes
     labels = [axis.get_ylabel() for axis in axes]
     assert all("(deg" in label or "(mm)" in label for label in labels)
-    legends = [
-        t.get_text() for axis in axes if axis.get_legend() for t in axis.get_legend().get_texts()
-    ]
+    drawn = [*figure.legends, *(axis.get_legend() for axis in axes if axis.get_legend())]
+    legends = [text.get_text() for legend in drawn for text in legend.get_texts()]
     assert "estimate" in legends
     assert ("encoder" in legends) == (truth and name != "bias")
     if name != "path":

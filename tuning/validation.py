@@ -22,6 +22,10 @@ class Row(NamedTuple):
     """Mean normalised innovation squared of the tracker by degree of freedom; 1 where consistent."""
     nees: float
     """Mean normalised attitude error squared by degree of freedom; 1 where honest."""
+    position_rmse_mm: float = float("nan")
+    """NaN where the model puts out no position, or the encoder tells none."""
+    position_nees: float = float("nan")
+    """As `nees`, of the position."""
 
 
 class Comparison(NamedTuple):
@@ -59,6 +63,8 @@ def compare(
                     judged.rate_rmse_deg_s,
                     _tracker_nis(made[i]),
                     judged.attitude_nees,
+                    judged.position_rmse_mm,
+                    judged.position_nees,
                 )
             )
     return Comparison(rows, estimates, recordings)
@@ -71,11 +77,15 @@ def _tracker_nis(estimate: Estimate) -> float:
 
 
 def mean_by_variant(rows: Sequence[Row], field: str = "attitude_rmse_deg") -> dict[str, float]:
-    """Mean over the runs of one column, by variant."""
+    """Mean of one column over the runs that have a number there, by variant; NaN of none."""
     grouped: dict[str, list[float]] = {}
     for row in rows:
-        grouped.setdefault(row.variant, []).append(float(getattr(row, field)))
-    return {name: sum(values) / len(values) for name, values in grouped.items()}
+        value = float(getattr(row, field))
+        grouped.setdefault(row.variant, []).extend([] if value != value else [value])
+    return {
+        name: sum(values) / len(values) if values else float("nan")
+        for name, values in grouped.items()
+    }
 
 
 def as_dicts(rows: Sequence[Row]) -> list[dict[str, Any]]:

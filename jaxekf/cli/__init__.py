@@ -16,9 +16,9 @@ from jaxekf.cli.tune import tune
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="jaxekf")
 def main() -> None:
-    """Attitude, rate and bias from recorded runs of an optical tracker and an IMU.
+    """Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
 
-    A run is a folder with recording.toml, optical.csv, imu.csv and, for truth, encoder.csv.
+    A run is a folder with recording.toml, optical.csv or markers.csv, imu.csv and, for truth, encoder.csv.
     """
     jax.config.update("jax_enable_x64", True)
     prepare()

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxekf.errors import JaxekfError
+from jaxekf.models import REGISTRY
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
@@ -24,7 +25,7 @@ model_option = click.option(
     "--model",
     default="loose",
     show_default=True,
-    help="loose, loose_rate, loose_additive, or your own as module:attribute.",
+    help=f"{', '.join(REGISTRY)}, or your own as module:attribute.",
 )
 noise_option = click.option(
     "--noise",

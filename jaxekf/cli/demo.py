@@ -9,12 +9,13 @@ import numpy as np
 
 import tuning
 from jaxekf.cli.console import json_option, note, print_json, tuning_progress
-from jaxekf.cli.plot import FIGURES, draw
+from jaxekf.cli.plot import draw
 from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo as runs
 from jaxekf.files import check_output, whole_folder
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
+from jaxekf.plots import possible_figures
 from jaxekf.storage import load
 from tuning.validation import as_dicts
 
@@ -60,7 +61,9 @@ def demo(output: Path, as_json: bool) -> None:
         tuned.save(folder)
         for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
             made.save(folder / "result" / recording.name)
-            chosen = FIGURES if recording.name == "constant-rate" else ("attitude", "occlusion")
+            chosen = ("attitude", "occlusion")
+            if recording.name == "constant-rate":
+                chosen = possible_figures(made, recording)
             files = draw(made, recording, folder / "figures", chosen)
             figures += [str(output / "figures" / file.name) for file in files]
         document = {

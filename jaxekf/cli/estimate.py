@@ -21,6 +21,7 @@ from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
 from jaxekf.files import check_output
 from jaxekf.models import get_model
+from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
 
@@ -77,6 +78,12 @@ def warn(made: Estimate) -> None:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("result"), show_default=True
 )
+@click.option(
+    "--online",
+    is_flag=True,
+    help="At each sample of the IMU only with what had arrived by then, as a live system with the"
+    " tracker's latency would have said; for models that an IMU drives.",
+)
 @overwrite_option
 @json_option
 def estimate(
@@ -84,6 +91,7 @@ def estimate(
     model: str,
     noise_files: tuple[str, ...],
     output: Path,
+    online: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -93,7 +101,10 @@ def estimate(
     recordings = load_runs(runs)
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
-    estimates = estimate_many(recordings, chosen, params)
+    if online:
+        estimates = [estimate_online(recording, chosen, params) for recording in recordings]
+    else:
+        estimates = estimate_many(recordings, chosen, params)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         folder = made.save(output / recording.name, overwrite=overwrite)
@@ -101,22 +112,31 @@ def estimate(
         warn(made)
         note(f"wrote {folder}")
     if as_json:
-        print_json({"model": chosen.name, "runs": summaries})
+        print_json({"model": chosen.name, "online": online, "runs": summaries})
         return
-    rows = [_row(summary) for summary in summaries]
-    columns = [
-        "run",
-        "seconds",
-        "attitude RMSE\n(deg)",
-        "rate RMSE\n(deg/s)",
-        "NEES",
-        "tracker\nNIS",
-        "tracker rows\nused",
-    ]
-    print_table(f"Estimates by {chosen.name}", columns, rows)
+    known = ", as known at each time" if online else ""
+    _print_estimates(f"Estimates by {chosen.name}{known}", summaries)
 
 
-def _row(summary: dict[str, Any]) -> list[Any]:
+def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
+    """One row a run; columns of position only where some run's can be judged."""
+    columns = ["run", "seconds"]
+    scores = {
+        "attitude_rmse_deg": "attitude RMSE\n(deg)",
+        "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
+        "attitude_nees": "NEES",
+    }
+    placed = [summary["score"]["position_rmse_mm"] for summary in summaries if "score" in summary]
+    if any(value == value for value in placed):
+        scores |= {
+            "position_rmse_mm": "position RMSE\n(mm)",
+            "position_nees": "position\nNEES",
+        }
+    columns += [*scores.values(), "tracker\nNIS", "tracker rows\nused"]
+    print_table(title, columns, [_row(summary, tuple(scores)) for summary in summaries])
+
+
+def _row(summary: dict[str, Any], scores: tuple[str, ...]) -> list[Any]:
     judged = summary.get("score", {})
     nan = float("nan")
     trackers = [n for n in summary["account"] if n == "optical" or n.startswith("marker_")]
@@ -125,9 +145,7 @@ def _row(summary: dict[str, Any]) -> list[Any]:
     return [
         summary["run"],
         summary["duration_s"],
-        judged.get("attitude_rmse_deg", nan),
-        judged.get("rate_rmse_deg_s", nan),
-        judged.get("attitude_nees", nan),
+        *(judged.get(name, nan) for name in scores),
         sum(known) / len(known) if known else nan,
         f"{used} of {read}",
     ]

@@ -56,13 +56,20 @@ def plot(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Estimate RUNS and draw attitude, rate, bias, the longest occlusion and the path of a marker."""
+    """Estimate RUNS and draw what model and recording can show.
+
+    attitude, position, velocity, rate: values, and errors where there is an encoder; bias; occlusion: the
+    longest time without a pose; path in three dimensions; of single markers visibility (used, refused,
+    hidden) and innovations.
+    """
     chosen = get_model(model)
     recordings = load_runs(runs)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
     for made, recording in zip(estimates, recordings, strict=True):
         names = figures or plots.possible_figures(made, recording)
+        if not names:
+            note(f"{made.run}: no figure: it needs samples of a tracker and ten instants or more")
         files += draw(made, recording, output, names)
     for file in files:
         note(f"wrote {file}")

@@ -4,37 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
-from jaxekf import files, storage
+from jaxekf import files, simulate_tool, storage
 from jaxekf import simulate as simulator
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json
+from jaxekf.cli.options import Finite, Span, hidden, spans
+from jaxekf.recording import Recording
 
-
-class _Finite(click.FloatRange):
-    """A number within bounds; NaN, which is within any, is refused."""
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        number = super().convert(value, param, ctx)
-        if number != number:
-            self.fail(f"got '{value}', expected a number; try 0", param, ctx)
-        return number
-
-
-def _spans(
-    _: click.Context, __: click.Parameter, values: tuple[str, ...]
-) -> list[tuple[float, float]]:
-    spans = []
-    for value in values:
-        try:
-            begin, end = (float(part) for part in value.split(","))
-        except ValueError:
-            raise click.BadParameter(
-                f"got '{value}', expected START,END in seconds; try 20,20.5"
-            ) from None
-        if not 0.0 <= begin < end:
-            raise click.BadParameter(f"got '{value}', expected 0 <= START < END; try 20,20.5")
-        spans.append((begin, end))
-    return spans
+# Options that one kind of motion has no use for: to take them in silence would simulate something else
+# than was asked.
+_ROTATION_ONLY = ("rate", "speed", "rest", "occlusion", "dropouts", "optical_noise")
+_TOOL_ONLY = ("hide", "latency", "marker_noise", "accelerometer_noise", "accelerometer_bias")
 
 
 @click.command()
@@ -43,10 +24,11 @@ def _spans(
 )
 @click.option(
     "--motion",
-    type=click.Choice(["free", "constant-rate"]),
+    type=click.Choice(["free", "constant-rate", "tool"]),
     default="free",
     show_default=True,
-    help="Smooth rotations about all axes, or the paper's turn about x.",
+    help="free: smooth rotations about all axes; constant-rate: the paper's turn about x; tool: a hand's"
+    " motion in six degrees of freedom, seen as single markers.",
 )
 @click.option("--runs", type=click.IntRange(1), default=1, show_default=True)
 @click.option(
@@ -56,115 +38,192 @@ def _spans(
     show_default=True,
     help="Of the first run; the next have the next.",
 )
+@click.option("--duration", type=Finite(0.5, 1e5), default=60.0, show_default=True, help="Seconds.")
 @click.option(
-    "--duration", type=_Finite(0.5, 1e5), default=60.0, show_default=True, help="Seconds."
-)
-@click.option(
-    "--rate",
-    type=_Finite(-1e4, 1e4),
-    default=-9.0,
-    show_default=True,
-    help="Constant rate, deg/s.",
+    "--rate", type=Finite(-1e4, 1e4), default=-9.0, show_default=True, help="Constant rate, deg/s."
 )
 @click.option(
     "--speed",
-    type=_Finite(-1e4, 1e4),
+    type=Finite(-1e4, 1e4),
     default=40.0,
     show_default=True,
     help="Free motion, deg/s rms per axis.",
 )
 @click.option(
-    "--rest",
-    type=_Finite(0.0),
-    default=5.0,
-    show_default=True,
-    help="Seconds at rest at the start.",
+    "--rest", type=Finite(0.0), default=5.0, show_default=True, help="Seconds at rest at the start."
 )
 @click.option(
-    "--occlusion", multiple=True, callback=_spans, help="START,END in seconds; repeatable."
+    "--occlusion", multiple=True, callback=spans, help="START,END in seconds; repeatable."
 )
 @click.option(
     "--dropouts",
-    type=_Finite(0.0, 1.0),
+    type=Finite(0.0, 1.0),
     default=0.0,
     show_default=True,
     help="Share of tracker samples lost.",
 )
 @click.option(
-    "--optical-noise",
-    type=_Finite(0.0, 1e3),
-    default=0.3,
-    show_default=True,
-    help="deg per axis.",
+    "--optical-noise", type=Finite(0.0, 1e3), default=0.3, show_default=True, help="deg per axis."
 )
 @click.option(
     "--gyroscope-noise",
-    type=_Finite(0.0, 1e3),
+    type=Finite(0.0, 1e3),
     default=0.05,
     show_default=True,
     help="deg/s/sqrt(Hz).",
 )
 @click.option(
     "--bias",
-    type=_Finite(0.0, 1e3),
+    type=Finite(0.0, 1e3),
     default=0.5,
     show_default=True,
-    help="deg/s, standard deviation at the start.",
+    help="Of the gyroscope, deg/s, standard deviation at the start.",
 )
 @click.option(
     "--bias-walk",
-    type=_Finite(0.0, 1e3),
-    default=0.005,
+    type=Finite(0.0, 1e3),
+    default=None,
+    help="Of the gyroscope, deg/s^2/sqrt(Hz).  [default: 0.005; tool 0.002]",
+)
+@click.option(
+    "--hide",
+    multiple=True,
+    callback=hidden,
+    help="Tool: START,END[,MARKER...]: seconds, and which of the markers 1, 2, 3 are hidden (all where"
+    " none is named); repeatable.",
+)
+@click.option(
+    "--latency",
+    type=Finite(0.0, 10.0),
+    default=0.034,
     show_default=True,
-    help="deg/s^2/sqrt(Hz).",
+    help="Tool: seconds from when a frame is taken to its stamp.",
+)
+@click.option(
+    "--marker-noise",
+    type=Finite(0.0, 1e3),
+    default=0.231,
+    show_default=True,
+    help="Tool: mm per axis.",
+)
+@click.option(
+    "--accelerometer-noise",
+    type=Finite(0.0, 1e6),
+    default=1.85,
+    show_default=True,
+    help="Tool: mg/sqrt(Hz).",
+)
+@click.option(
+    "--accelerometer-bias",
+    type=Finite(0.0, 1e3),
+    default=0.1,
+    show_default=True,
+    help="Tool: m/s^2, standard deviation at the start.",
 )
 @overwrite_option
 @json_option
+@click.pass_context
 def simulate(
+    ctx: click.Context,
     output: Path,
     motion: str,
     runs: int,
     seed: int,
-    duration: float,
-    rate: float,
-    speed: float,
-    rest: float,
-    occlusion: list[tuple[float, float]],
-    dropouts: float,
-    optical_noise: float,
-    gyroscope_noise: float,
-    bias: float,
-    bias_walk: float,
     overwrite: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
-    """Simulate runs: 62.5 Hz tracker, 125 Hz gyroscope, encoder. Every seed is explicit."""
-    grade = simulator.SensorGrade(
-        gyroscope_deg=gyroscope_noise,
-        bias_walk_deg=bias_walk,
-        bias_deg=bias,
-        optical_deg=optical_noise,
-    )
+    """Simulate runs with their truth. Every seed is explicit.
+
+    The motions free and constant-rate have a 62.5 Hz tracker of the attitude, a 125 Hz gyroscope and an
+    encoder: for `jaxekf estimate RUN`. A tool has three markers on an L with legs of 10 cm, seen every 18
+    ms and stamped late, a 500 Hz gyroscope and accelerometer in its corner, and the true pose: for
+    `jaxekf estimate RUN --model tight`.
+    """
+    _refuse_what_does_not_apply(ctx, motion)
     for number in range(seed, seed + runs):
         files.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
     written = []
     for number in range(seed, seed + runs):
-        chosen = (
-            simulator.constant_rate_motion(rate, rest)
-            if motion == "constant-rate"
-            else simulator.free_motion(number, speed_deg=speed, rest_s=rest)
-        )
-        name = f"{motion}-{number}"
-        recording = simulator.recording(
-            name,
-            chosen,
-            seed=number,
-            duration_s=duration,
-            grade=grade,
-            occlusions=occlusion,
-            dropouts=dropouts,
-        )
-        written.append(str(storage.save(recording, output / name, overwrite=overwrite, digits=10)))
+        record = _tool if motion == "tool" else _rotation
+        recording = record(motion, number, options)
+        folder = output / recording.name
+        written.append(str(storage.save(recording, folder, overwrite=overwrite, digits=10)))
         note(f"wrote {written[-1]}")
     if as_json:
         print_json({"runs": written})
+
+
+def _refuse_what_does_not_apply(ctx: click.Context, motion: str) -> None:
+    """An option that this motion has no use for is a mistake, not to be passed over."""
+    for name in _ROTATION_ONLY if motion == "tool" else _TOOL_ONLY:
+        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            other = "another motion" if motion == "tool" else "--motion tool"
+            hint = "; hide markers by --hide" if name == "occlusion" else ""
+            raise click.UsageError(
+                f"got --{name.replace('_', '-')} with --motion {motion}, expected it with {other} only;"
+                f" leave it out{hint}"
+            )
+
+
+def _rotation(motion: str, seed: int, options: dict[str, Any]) -> Recording:
+    """A run of the tracker's attitude and a gyroscope."""
+    walk = options["bias_walk"]
+    grade = simulator.SensorGrade(
+        gyroscope_deg=options["gyroscope_noise"],
+        bias_walk_deg=0.005 if walk is None else walk,
+        bias_deg=options["bias"],
+        optical_deg=options["optical_noise"],
+    )
+    chosen = (
+        simulator.constant_rate_motion(options["rate"], options["rest"])
+        if motion == "constant-rate"
+        else simulator.free_motion(seed, speed_deg=options["speed"], rest_s=options["rest"])
+    )
+    return simulator.recording(
+        f"{motion}-{seed}",
+        chosen,
+        seed=seed,
+        duration_s=options["duration"],
+        grade=grade,
+        occlusions=options["occlusion"],
+        dropouts=options["dropouts"],
+    )
+
+
+def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
+    """A run of single markers, gyroscope and accelerometer."""
+    walk, given = options["bias_walk"], simulate_tool.ToolGrade()
+    grade = simulate_tool.ToolGrade(
+        gyroscope_deg=options["gyroscope_noise"],
+        accelerometer_mg=options["accelerometer_noise"],
+        bias_walk_deg=given.bias_walk_deg if walk is None else walk,
+        bias_deg=options["bias"],
+        accelerometer_bias=options["accelerometer_bias"],
+        marker_mm=options["marker_noise"],
+        latency_s=options["latency"],
+    )
+    tool = simulate_tool.Tool()
+    return simulate_tool.tool_recording(
+        f"{motion}-{seed}",
+        simulate_tool.free_tool_motion(seed),
+        seed=seed,
+        duration_s=options["duration"],
+        grade=grade,
+        tool=tool,
+        hidden=_hidden(options["hide"], tool.names),
+    )
+
+
+def _hidden(asked: list[Span], names: tuple[str, ...]) -> simulate_tool.Hidden:
+    """Marker by marker; a span that names none hides all."""
+    found = []
+    for span in asked:
+        for name in span.markers or names:
+            if name not in names:
+                raise click.UsageError(
+                    f"got the marker '{name}' in --hide, expected one of {', '.join(names)};"
+                    " check its name"
+                )
+            found.append((name, span.begin_s, span.end_s))
+    return found

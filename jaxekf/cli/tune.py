@@ -172,10 +172,19 @@ def _short(value: object) -> str:
 
 def print_comparison(title: str, rows: list[tuning.Row]) -> None:
     """The table that sets variants beside each other, run by run and on average."""
-    columns = ["run", "noise", "attitude RMSE\n(deg)", "rate RMSE\n(deg/s)", "tracker\nNIS", "NEES"]
-    shown = [list(row) for row in rows]
-    fields = ("attitude_rmse_deg", "rate_rmse_deg_s", "nis", "nees")
-    means = {field: tuning.mean_by_variant(rows, field) for field in fields}
+    columns = {
+        "attitude_rmse_deg": "attitude RMSE\n(deg)",
+        "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
+        "nis": "tracker\nNIS",
+        "nees": "NEES",
+    }
+    if any(row.position_rmse_mm == row.position_rmse_mm for row in rows):
+        columns |= {
+            "position_rmse_mm": "position RMSE\n(mm)",
+            "position_nees": "position\nNEES",
+        }
+    shown = [[row.run, row.variant, *(getattr(row, field) for field in columns)] for row in rows]
+    means = {field: tuning.mean_by_variant(rows, field) for field in columns}
     for variant in dict.fromkeys(row.variant for row in rows):
-        shown.append(["mean", variant, *(means[field][variant] for field in fields)])
-    print_table(title, columns, shown)
+        shown.append(["mean", variant, *(means[field][variant] for field in columns)])
+    print_table(title, ["run", "noise", *columns.values()], shown)

@@ -3,14 +3,33 @@
 import numpy as np
 
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Floats, Optical, Recording, Samples, to_scipy
+from jaxekf.recording import Floats, Markers, Optical, Recording, Samples, to_scipy
 
 
 def optical_attitude(recording: Recording) -> Samples:
     """The tracker's attitude, quaternions (N, 4), hidden samples masked."""
+    if recording.optical is None and recording.markers is not None:
+        raise RecordingError(
+            recording.path or recording.name,
+            "single markers and no optical stream",
+            "the tracker's attitude for this model",
+            "the model tight (--model tight), which takes single markers",
+        )
     optical = recording.need_optical()
     taken = optical.time_ns - optical.latency_ns
     return Samples(taken, optical.q_ref_body, optical.valid, latency_ns=optical.latency_ns)
+
+
+def single_markers(recording: Recording) -> Markers:
+    """The markers, or an error that names a model for what the run has instead."""
+    if recording.markers is None and recording.optical is not None:
+        raise RecordingError(
+            recording.path or recording.name,
+            "an optical stream and no single markers",
+            "markers for this model",
+            "the model loose, or loose_pose where the tracker tells positions",
+        )
+    return recording.need_markers()
 
 
 def gyroscope(recording: Recording) -> Samples:

@@ -69,7 +69,7 @@ def sensor_name(marker: str) -> str:
 
 def _source(name: str, recording: Recording) -> Samples:
     """A marker's positions (N, 3); masked everywhere where the recording does not have the marker."""
-    markers = recording.need_markers()
+    markers = sources.single_markers(recording)
     count = len(markers.time_ns)
     taken = markers.time_ns - markers.latency_ns
     if name not in markers.names:
@@ -83,7 +83,7 @@ def _source(name: str, recording: Recording) -> Samples:
 
 
 def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
-    markers = recording.need_markers()
+    markers = sources.single_markers(recording)
     places = dict(zip(markers.names, markers.p_body_marker, strict=True))
     # A marker that this recording does not have is never seen: any place will do.
     arms = np.array([places.get(name, np.zeros(3)) for name in names], float)
@@ -93,7 +93,7 @@ def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
     """The first frame in which three markers, not on a line, give a pose; what came before is dropped."""
     times = next(iter(samples.values())).time_ns
-    raw = pose.from_markers(recording.need_markers())
+    raw = pose.from_markers(sources.single_markers(recording))
     inside = np.isin(raw.time_ns - raw.latency_ns, times)
     valid = raw.valid & inside
     if not valid.any() or raw.position is None:
@@ -119,7 +119,7 @@ def adapt(recordings: Sequence[Recording]) -> Model:
     """The model with a sensor for every marker of these recordings."""
     names: dict[str, None] = {}
     for recording in recordings:
-        names |= dict.fromkeys(recording.need_markers().names)
+        names |= dict.fromkeys(sources.single_markers(recording).names)
     return for_markers(tuple(names)) if names else MODEL
 
 

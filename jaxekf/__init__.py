@@ -16,6 +16,7 @@ from jaxekf.errors import (
 )
 from jaxekf.estimation import estimate, estimate_many
 from jaxekf.interpolation import InputSample
+from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
 from jaxekf.kernels import jit
 from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
 from jaxekf.metrics import Score, score
@@ -44,6 +45,7 @@ __all__ = [
     "Imu",
     "Input",
     "InputSample",
+    "IteratedOutput",
     "JaxekfError",
     "Known",
     "Manifold",
@@ -78,6 +80,8 @@ __all__ = [
     "rotation",
     "run_filter",
     "run_filter_batch",
+    "run_iterated_smoother",
+    "run_iterated_smoother_batch",
     "run_smoother",
     "run_smoother_batch",
     "save",

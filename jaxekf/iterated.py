@@ -48,6 +48,8 @@ class IteratedOutput(NamedTuple):
     """At the end of each substep, leading axes (K, S)."""
     start: Belief
     """At the start of the run."""
+    noise: Array
+    """(K, S, n_w) the process noise that carries the path from each substep to the next."""
     moved: Array
     """(iterations,) the longest move of a state in each, in standard deviations of the smoothed one:
     small at the end where the iteration has converged."""
@@ -119,7 +121,7 @@ def run_iterated_smoother_batch(
         shown = smoothed, start
         moved.append(longest)
     every = jnp.stack(moved, axis=1) if moved else jnp.zeros((steps.dt.shape[0], 0), dtype)
-    return IteratedOutput(first.filtered, *shown, every)
+    return IteratedOutput(first.filtered, *shown, path.noise, every)
 
 
 def _used(first: SmootherOutput, steps: Steps) -> Given:

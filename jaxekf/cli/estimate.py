@@ -84,6 +84,11 @@ def warn(made: Estimate) -> None:
     help="At each sample of the IMU only with what had arrived by then, as a live system with the"
     " tracker's latency would have said; for models that an IMU drives.",
 )
+@click.option(
+    "--smooth",
+    is_flag=True,
+    help="Each instant from the whole run, not only from what was measured until then.",
+)
 @overwrite_option
 @json_option
 def estimate(
@@ -92,10 +97,16 @@ def estimate(
     noise_files: tuple[str, ...],
     output: Path,
     online: bool,
+    smooth: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Estimate RUNS and write a result folder for each under the output."""
+    if online and smooth:
+        raise click.UsageError(
+            "got --online and --smooth, expected one of them: what was known at a time does not know the"
+            " whole run; leave one out"
+        )
     chosen = get_model(model)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs)
@@ -104,7 +115,7 @@ def estimate(
     if online:
         estimates = [estimate_online(recording, chosen, params) for recording in recordings]
     else:
-        estimates = estimate_many(recordings, chosen, params)
+        estimates = estimate_many(recordings, chosen, params, smooth=smooth)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         folder = made.save(output / recording.name, overwrite=overwrite)
@@ -112,9 +123,9 @@ def estimate(
         warn(made)
         note(f"wrote {folder}")
     if as_json:
-        print_json({"model": chosen.name, "online": online, "runs": summaries})
+        print_json({"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries})
         return
-    known = ", as known at each time" if online else ""
+    known = ", as known at each time" if online else ", smoothed" if smooth else ""
     _print_estimates(f"Estimates by {chosen.name}{known}", summaries)
 
 

@@ -115,13 +115,14 @@ def run_iterated_smoother_batch(
         trees = reverse_only(trees)
     else:
         function = partial(recursion.on_lanes, partial(_iteration, ready, False))
-    moved, shown = [], (first.smoothed, first.start)
-    for _ in range(iterations):
-        path, smoothed, start, longest = function(*trees, path)
-        shown = smoothed, start
-        moved.append(longest)
-    every = jnp.stack(moved, axis=1) if moved else jnp.zeros((steps.dt.shape[0], 0), dtype)
-    return IteratedOutput(first.filtered, *shown, path.noise, every)
+
+    def iterate(carry: Any, _: None) -> Any:
+        path, smoothed, start, longest = function(*trees, carry[0])
+        return (path, smoothed, start), longest
+
+    begun = (path, Belief(*first.smoothed), Belief(*first.start))
+    (path, smoothed, start), moved = lax.scan(iterate, begun, None, length=iterations)
+    return IteratedOutput(first.filtered, smoothed, start, path.noise, jnp.moveaxis(moved, 0, 1))
 
 
 def _used(first: SmootherOutput, steps: Steps) -> Given:

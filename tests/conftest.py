@@ -1,6 +1,9 @@
 """Settings and fixtures shared by all tests."""
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -9,6 +12,14 @@ from hypothesis import settings
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Nearly all the time goes into compiling. Programs are kept for this run of the tests, so that what two
+# files, or the two processes, ask for is compiled once; the first process makes the folder.
+if "JAXEKF_TEST_PROGRAMS" not in os.environ:
+    os.environ["JAXEKF_TEST_PROGRAMS"] = tempfile.mkdtemp(prefix="jaxekf-programs-")
+    atexit.register(shutil.rmtree, os.environ["JAXEKF_TEST_PROGRAMS"], ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ["JAXEKF_TEST_PROGRAMS"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 settings.register_profile("jaxekf", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("jaxekf")

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf import algebra, linalg, patterned, recursion
+from jaxekf import algebra, epochs, linalg, patterned
 from jaxekf.algebra import Gained, Rows, Solved
 from jaxekf.kernels import loop
 from jaxekf.lanes import written_sum
@@ -89,7 +89,7 @@ def _epoch(
         info = _before_update(system, prepared, info, instant, samples, adjoint)
         return _before_prediction(system, prepared, info, instant, adjoint), belief
 
-    return recursion.over_substeps_back(substep, info, (every, fast), slow)
+    return epochs.over_substeps_back(substep, info, (every, fast), slow)
 
 
 def smoothed(

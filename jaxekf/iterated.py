@@ -17,7 +17,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf import about, algebra, backward, ekf, linalg, patterned, recursion, smoother, step
+from jaxekf import (
+    about,
+    algebra,
+    backward,
+    ekf,
+    epochs,
+    linalg,
+    own_derivative,
+    patterned,
+    smoother,
+    step,
+)
 from jaxekf.about import AboutSystem
 from jaxekf.algebra import Gained
 from jaxekf.backward import Information
@@ -114,7 +125,7 @@ def run_iterated_smoother_batch(
         function = _lanes(ready, tuple(devices))
         trees = reverse_only(trees)
     else:
-        function = partial(recursion.on_lanes, partial(_iteration, ready, False))
+        function = partial(own_derivative.on_lanes, partial(_iteration, ready, False))
 
     def iterate(carry: Any, _: None) -> Any:
         path, smoothed, start, longest = function(*trees, carry[0])
@@ -138,7 +149,7 @@ def _used(first: SmootherOutput, steps: Steps) -> Given:
 
 @lru_cache(maxsize=64)
 def _lanes(system: AboutSystem, devices: tuple[Any, ...]) -> Any:
-    return recursion.with_own_derivative(
+    return own_derivative.with_own_derivative(
         devices, system.is_plain, partial(_iteration, system, True)
     )
 
@@ -237,7 +248,7 @@ def _epoch_ahead(
         place, samples = at
         return _ahead(system, prepared, carry, place, samples, adjoint)
 
-    return recursion.over_substeps(substep, carry, (places, fast), slow)
+    return epochs.over_substeps(substep, carry, (places, fast), slow)
 
 
 def _epoch_back(
@@ -258,7 +269,7 @@ def _epoch_back(
         info, noise = _before(system, prepared, place, info, adjoint)
         return info, (found[0], noise, found[1])
 
-    return recursion.over_substeps_back(substep, info, ((places, forward), fast), slow)
+    return epochs.over_substeps_back(substep, info, ((places, forward), fast), slow)
 
 
 def _before(

@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from jaxekf import kernels, linalg
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
+from jaxekf.own_derivative import inexact, merge, unfilled
 from jaxekf.step import Moment, Outcome, Track, begin, predict, update
 from jaxekf.system import System
 
@@ -131,39 +131,6 @@ def _gathered(earlier: Kept | None, last: Kept, slow: Any) -> Kept:
     return whole._replace(used=whole.used | ended[0], gated=whole.gated | ended[1])
 
 
-def over_substeps(
-    substep: Callable[..., Any], carry: Any, every: Any, slow: Any
-) -> tuple[Any, Any]:
-    """``substep(carry, (what, samples))`` over an epoch; `every` is what it is given and fast samples, with
-    a leading axis (S,), and slow samples come with the last."""
-    what, fast = jax.tree.map(lambda a: a[-1], every)
-    earlier = None
-    if jax.tree.leaves(every)[0].shape[0] > 1:
-        rest = jax.tree.map(lambda a: a[:-1], every)
-        carry, earlier = lax.scan(substep, carry, rest)
-    carry, last = substep(carry, (what, fast | slow))
-    return carry, _with_last(earlier, last)
-
-
-def over_substeps_back(
-    substep: Callable[..., Any], carry: Any, every: Any, slow: Any
-) -> tuple[Any, Any]:
-    """As `over_substeps`, from the last to the first."""
-    what, fast = jax.tree.map(lambda a: a[-1], every)
-    carry, last = substep(carry, (what, fast | slow))
-    earlier = None
-    if jax.tree.leaves(every)[0].shape[0] > 1:
-        rest = jax.tree.map(lambda a: a[:-1], every)
-        carry, earlier = lax.scan(substep, carry, rest, reverse=True)
-    return carry, _with_last(earlier, last)
-
-
-def _with_last(earlier: Any, last: Any) -> Any:
-    if earlier is None:
-        return jax.tree.map(lambda a: a[None], last)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
-
-
 # --- one block of runs, on lanes ----------------------------------------------------------------------
 
 
@@ -243,14 +210,14 @@ def _scan_back(
     `cotangents` are those of the live leaves of `Kept`; the others have none.
     """
     leaves, tree = jax.tree.flatten(given)
-    floats, moving_prepared = _inexact(prepared)
+    floats, moving_prepared = inexact(prepared)
 
     def back(carry: Any, at: Any) -> Any:
         after, total = carry
         start, leaves, cotangents = at
 
         def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
-            full = _merge(moving, moved, leaves)
+            full = merge(moving, moved, leaves)
             values = moving_prepared(floats)
             track, kept = _epoch(system, what, True, values, track, jax.tree.unflatten(tree, full))
             return track, [v for f, v in zip(live, jax.tree.leaves(kept), strict=True) if f]
@@ -284,22 +251,6 @@ def _scan_back(
     return total, first.belief, of_given
 
 
-def _inexact(tree: Any) -> tuple[list[Array], Callable[[list[Array]], Any]]:
-    """The floating-point leaves of a tree, and how to put others in their place."""
-    leaves, structure = jax.tree.flatten(tree)
-    flags = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
-
-    def put(floats: list[Array]) -> Any:
-        return jax.tree.unflatten(structure, _merge(flags, floats, leaves))
-
-    return [leaf for f, leaf in zip(flags, leaves, strict=True) if f], put
-
-
-def _merge(flags: Any, chosen: list[Any], others: list[Any]) -> list[Any]:
-    found = iter(chosen)
-    return [next(found) if f else other for f, other in zip(flags, others, strict=True)]
-
-
 # --- all runs -----------------------------------------------------------------------------------------
 
 
@@ -320,44 +271,6 @@ def filter_plainly(
         return lax.scan(epoch, begin(system, *first), given)[1], None
 
     return in_blocks((), runs, None, prepared, first, given)[0]
-
-
-def with_own_derivative(
-    devices: Devices, plain: bool, scan: Callable[..., Any]
-) -> Callable[..., Any]:
-    """A scan of trees with lanes last as a function of many runs, on the first axis.
-
-    Its reverse derivative is JAX's own, taken block by block on lanes; `vmap` of both is the same for more
-    runs. `plain` says that the scan is arithmetic only.
-    """
-    whole = partial(kernels.block, scan) if plain else scan
-
-    def run(_: None, *trees: Any) -> Any:
-        return in_blocks(devices, lambda _, *trees: (whole(*trees), None), None, *trees)
-
-    def run_back(_: None, cotangents: Any, *trees: Any) -> Any:
-        def one(_: None, cotangents: Any, *trees: Any) -> Any:
-            floats, put = _inexact(trees)
-            return jax.vjp(lambda floats: scan(*put(floats)), floats)[1](cotangents)[0], None
-
-        return in_blocks(devices, one, None, cotangents, *trees)
-
-    ahead, back = over_more_runs(devices, run), over_more_runs(devices, run_back)
-
-    @jax.custom_vjp
-    def function(*trees: Any) -> Any:
-        return ahead(None, *trees)[0]
-
-    def backward(trees: Any, cotangents: Any) -> Any:
-        return _unfilled(trees, None, back(None, cotangents, *trees)[0])
-
-    function.defvjp(lambda *trees: (function(*trees), trees), backward)
-    return function
-
-
-def on_lanes(scan: Callable[..., Any], *trees: Any) -> Any:
-    """A scan of trees with lanes last, for many runs, with JAX's own derivatives in both modes."""
-    return in_blocks((), lambda _, *trees: (scan(*trees), None), None, *trees)[0]
 
 
 def filter_with_adjoint(
@@ -414,8 +327,8 @@ def _with_adjoint(
         total, first, of_given = back(starts, prepared, given, chosen)[0]
         # When samples were refused decides what is let in, but nothing depends on it smoothly.
         refused = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
-        back_to_given = _unfilled(given, flags.given, of_given)
-        return _unfilled(prepared, None, total), First(first, refused), back_to_given
+        back_to_given = unfilled(given, flags.given, of_given)
+        return unfilled(prepared, None, total), First(first, refused), back_to_given
 
     function.defvjp(forward, backward, symbolic_zeros=True)
     return function
@@ -461,19 +374,6 @@ def _symmetric(cotangents: Kept) -> Kept:
     if prior is not None:
         prior = prior._replace(cov=symmetric(prior.cov))
     return cotangents._replace(prior=prior, cov=symmetric(cotangents.cov))
-
-
-def _unfilled(tree: Any, flags: Any, found: list[Array]) -> Any:
-    """Cotangents in the structure of `tree`: those found, and zeros for the others."""
-    leaves, structure = jax.tree.flatten(tree)
-    if flags is None:
-        flags = [jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in leaves]
-    others = [
-        None if jnp.issubdtype(leaf.dtype, jnp.inexact) else np.zeros(leaf.shape, jax.dtypes.float0)
-        for leaf in leaves
-    ]
-    merged = _merge(flags, found, others)
-    return jax.tree.unflatten(structure, merged)
 
 
 def segment_length(epochs: int, bytes_per_epoch: int) -> int:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxekf import backward, ekf, recursion
+from jaxekf import backward, ekf, own_derivative
 from jaxekf.backward import Filtered
 from jaxekf.ekf import FilterOutput
 from jaxekf.model import Belief, Model, Parameters
@@ -68,11 +68,11 @@ def run_smoother_batch(
     if adjoint:
         smoothed, start = _lanes(ready, tuple(devices))(*reverse_only(trees))
     else:
-        smoothed, start = recursion.on_lanes(partial(backward.scan_back, ready, False), *trees)
+        smoothed, start = own_derivative.on_lanes(partial(backward.scan_back, ready, False), *trees)
     return SmootherOutput(filtered, smoothed, start)
 
 
 @lru_cache(maxsize=64)
 def _lanes(system: System, devices: tuple[Any, ...]) -> Any:
     scan = partial(backward.scan_back, system, True)
-    return recursion.with_own_derivative(devices, system.is_plain, scan)
+    return own_derivative.with_own_derivative(devices, system.is_plain, scan)

@@ -103,11 +103,12 @@ def hide(recording: jaxekf.Recording, length_s: float) -> Case:
     good = good_frames(recording)
     t = optical.time_ns / 1e9
     valid, gaps = optical.valid.copy(), []
-    start = t[0] + SETTLE_S
-    while start + length_s < t[-1] - 0.5:
+    driven = recording.need_imu().time_ns[[0, -1]] / 1e9
+    start, last = max(t[0], driven[0]) + SETTLE_S, min(t[-1] - 0.5, driven[1])
+    while start + length_s < last:
         inside = np.flatnonzero((t >= start) & (t <= start + length_s))
         before = int(inside[0]) - 1 if inside.size else 0
-        whole = inside.size and good[inside[-1]] and good[before - 6 : before + 1].all()
+        whole = inside.size and good[inside[-1]] and good[max(0, before - 6) : before + 1].all()
         if whole and abs(t[inside[-1]] - t[before] - length_s) < 0.05:
             valid[inside] = False
             gaps.append(Gap(before, int(inside[-1])))
@@ -166,12 +167,15 @@ def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, An
     off = made.outputs["position"].value[at] + turn.apply(point) - optical.position
     angle = np.rad2deg((turn.inv() * to_scipy(optical.q_ref_body)).magnitude())
     judged = good & inside
+    seen = optical.valid & inside
+    both = seen[1:] & seen[:-1]
     record = made.sensors["optical"]
     return {
-        "outlier_steps": int((turning_off(recording) > STEP_DEG).sum()),
+        "outlier_steps": int((turning_off(recording) > STEP_DEG)[both].sum()),
         "refused": int(record.gated.any(axis=1).sum()),
         "frames": len(record.time_ns),
         "median_deg": float(np.median(angle[judged])),
+        "median_mm": 1e3 * float(np.median(np.linalg.norm(off[judged], axis=1))),
         "largest_deg_1_in_1000": float(np.quantile(angle[judged], 0.999)),
         "largest_mm_1_in_1000": 1e3
         * float(np.quantile(np.linalg.norm(off[judged], axis=1), 0.999)),
@@ -186,17 +190,17 @@ def _nearest(times: Times, asked: Times) -> Any:
 def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Recording]:
     """The recordings of a folder, only the rooms named where there are any."""
     found = asl.find(folder)
-    if rooms:
-        wanted = {int(room) for room in rooms}
-        found = [
-            p
-            for p in found
-            if (m := re.search(r"room_?(\d+)", str(p.name))) and int(m[1]) in wanted
-        ]
     if not found:
         sys.exit(
             f"{folder}: got no recording in the ASL layout, expected TUM-VI rooms or EuRoC folders"
         )
+    if rooms:
+        named = [(re.search(r"room_?(\d+)", path.resolve().as_posix()), path) for path in found]
+        there = {int(match[1]) for match, _ in named if match}
+        if missing := [room for room in rooms if not room.isdecimal() or int(room) not in there]:
+            sys.exit(f"{folder}: got no room {', '.join(missing)}, expected one of {sorted(there)}")
+        wanted = {int(room) for room in rooms}
+        found = [path for match, path in named if match and int(match[1]) in wanted]
     return [asl.load(path) for path in found]
 
 
@@ -222,7 +226,9 @@ def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool
         )
     for name, found in outlying.items():
         checks[f"{name}: outliers do not make it diverge"] = (
-            found["largest_deg_1_in_1000"] < 5.0 and found["largest_deg_at_the_end"] < 2.0
+            found["largest_deg_1_in_1000"] < 5.0
+            and found["largest_deg_at_the_end"] < 2.0
+            and found["median_mm"] < 20.0
         )
     return checks
 
@@ -261,6 +267,8 @@ def main() -> None:
     for name, found in outlying.items():
         print(f"{name}: {found}")
     checks = checks_of(summary, outlying)
+    for length in table.keys() - summary.keys():
+        checks[f"a stretch of {length} s to hide"] = False
     for text, passed in checks.items():
         print(f"{'ok    ' if passed else 'MISSED'} {text}")
     print(json.dumps({"median": summary, "outliers": outlying, "checks": checks}))
@@ -268,4 +276,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except jaxekf.JaxekfError as error:
+        sys.exit(str(error))

@@ -110,7 +110,8 @@ class Stream:
             instants = self._open_instants(now)
             if len(instants) <= self._capacity:
                 break
-            self._filter(instants[: self._capacity], len(instants) - self._capacity)
+            final = min(len(instants) - self._capacity, self._capacity)
+            self._filter(instants[: self._capacity], final)
         final = sum(1 for t in instants if t < now - self._horizon_ns)
         belief, outputs = self._filter(instants, final)
         return Known(now, belief, outputs)

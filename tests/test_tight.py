@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import metrics, online, pose, simulate_tool
+from jaxekf import metrics, online, pose, simulate_tool, timeline
 from jaxekf.errors import ModelError, RecordingError
 from jaxekf.models import tight
 from jaxekf.parameters import as_arrays
@@ -302,3 +302,17 @@ def test_names_of_markers_choose_the_model():
     np.testing.assert_allclose(both[0].cov, alone.cov, atol=1e-12)
     assert both[1].account["marker_4"]["used"] == 0
     assert jnp.shape(both[1].params.setup.p_body_marker) == (4, 3)
+
+
+@pytest.mark.parametrize("frame", [0, 1])
+def test_a_start_does_not_trust_an_outlier(frame):
+    """One marker 50 mm off in one of the two frames that give pose and velocity: metres of error for
+    seconds, while the gates refuse every good sample."""
+    one = run(4, duration_s=0.5)
+    position = one.markers.position.copy()
+    position[frame, 0] += 0.05
+    spoilt = one.replace(markers=replace(one.markers, position=position))
+    model = tight.adapt([one])
+    good, found = timeline.build(model, one).first, timeline.build(model, spoilt).first
+    np.testing.assert_allclose(found["position"], good["position"], atol=0.01)
+    np.testing.assert_allclose(found["velocity"], good["velocity"], atol=0.2)

@@ -176,10 +176,11 @@ def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, An
         "frames": len(record.time_ns),
         "median_deg": float(np.median(angle[judged])),
         "median_mm": 1e3 * float(np.median(np.linalg.norm(off[judged], axis=1))),
+        "largest_deg_1_in_100": float(np.quantile(angle[judged], 0.99)),
         "largest_deg_1_in_1000": float(np.quantile(angle[judged], 0.999)),
         "largest_mm_1_in_1000": 1e3
         * float(np.quantile(np.linalg.norm(off[judged], axis=1), 0.999)),
-        "largest_deg_at_the_end": float(angle[np.flatnonzero(judged)[-100:]].max()),
+        "median_deg_at_the_end": float(np.median(angle[np.flatnonzero(judged)[-100:]])),
     }
 
 
@@ -188,7 +189,8 @@ def _nearest(times: Times, asked: Times) -> Any:
 
 
 def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Recording]:
-    """The recordings of a folder, only the rooms named where there are any."""
+    """The recordings of a folder, only the rooms named where there are any; one that cannot be read is
+    left out with a sentence, unless none is left."""
     found = asl.find(folder)
     if not found:
         sys.exit(
@@ -201,13 +203,30 @@ def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Reco
             sys.exit(f"{folder}: got no room {', '.join(missing)}, expected one of {sorted(there)}")
         wanted = {int(room) for room in rooms}
         found = [path for match, path in named if match and int(match[1]) in wanted]
-    return [asl.load(path) for path in found]
+    readable = []
+    for path in found:
+        try:
+            readable.append(asl.load(path))
+        except jaxekf.RecordingError as error:
+            print(f"left out: {error}", file=sys.stderr)
+    if not readable:
+        sys.exit(
+            f"{folder}: got no recording that can be read, expected one; mend what is said above"
+        )
+    return readable
 
 
 def medians(errors: list[tuple[float, float]]) -> dict[str, float]:
     """Median position and attitude error."""
     position, attitude = np.median(np.array(errors), axis=0)
     return {"mm": float(position), "deg": float(attitude)}
+
+
+def label(recording: jaxekf.Recording, taken: dict[str, Any]) -> str:
+    """A name for the recording that no other has."""
+    if recording.name not in taken:
+        return recording.name
+    return f"{recording.name} {len(taken) + 1}"
 
 
 def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool]:
@@ -225,9 +244,10 @@ def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool
             half["estimate"]["mm"] <= 0.2 * half["constant velocity"]["mm"]
         )
     for name, found in outlying.items():
+        # A filter astray stays so for many frames; a single one of motion capture's may be wrong.
         checks[f"{name}: outliers do not make it diverge"] = (
-            found["largest_deg_1_in_1000"] < 5.0
-            and found["largest_deg_at_the_end"] < 2.0
+            found["largest_deg_1_in_100"] < 2.0
+            and found["median_deg_at_the_end"] < 1.0
             and found["median_mm"] < 20.0
         )
     return checks
@@ -241,15 +261,20 @@ def main() -> None:
     arguments = parser.parse_args()
     recordings = chosen_recordings(arguments.folder, arguments.rooms)
     table: dict[str, dict[str, list[Any]]] = {}
-    outlying = {}
+    outlying, failed = {}, []
     with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("recordings", total=len(recordings))
         for recording in recordings:
             params = parameters_of(recording)
             cases = [hide(recording, length) for length in arguments.hide]
             runs = [recording, *(case.hidden for case in cases)]
-            whole, *found = jaxekf.estimate_many(runs, "loose_pose", params)
-            outlying[recording.name] = outliers(recording, whole)
+            try:
+                whole, *found = jaxekf.estimate_many(runs, "loose_pose", params)
+            except jaxekf.JaxekfError as error:
+                print(f"left out: {error}", file=sys.stderr)
+                failed.append(recording.name)
+                continue
+            outlying[label(recording, outlying)] = outliers(recording, whole)
             for case, made in zip(cases, found, strict=True):
                 by_method = table.setdefault(f"{case.length_s:g}", {name: [] for name in METHODS})
                 for name, errors in score(case, made).items():
@@ -269,6 +294,7 @@ def main() -> None:
     checks = checks_of(summary, outlying)
     for length in table.keys() - summary.keys():
         checks[f"a stretch of {length} s to hide"] = False
+    checks |= {f"{name}: can be estimated": False for name in failed}
     for text, passed in checks.items():
         print(f"{'ok    ' if passed else 'MISSED'} {text}")
     print(json.dumps({"median": summary, "outliers": outlying, "checks": checks}))
@@ -276,7 +302,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except jaxekf.JaxekfError as error:
-        sys.exit(str(error))
+    main()

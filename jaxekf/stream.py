@@ -15,7 +15,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters, Sensor
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import NANOSECONDS, Floats
-from jaxekf.timeline import Rows, Steps, knots_from
+from jaxekf.timeline import LONGEST_INPUT_GAP_S, Rows, Steps, knots_from
 
 _INPUT_KEPT_NS = NANOSECONDS
 """The input before the horizon that a clock offset may reach back to."""
@@ -75,11 +75,22 @@ class Stream:
         self._samples: dict[int, dict[str, _Sample]] = {}
 
     def put_input(self, time_ns: int, value: Any) -> None:
-        """A sample of the input, such as the IMU's; they come in order of time."""
+        """A sample of the input, such as the IMU's; they come in order of time.
+
+        Raises `ModelError` for a time that does not increase, and after a gap too long to bridge.
+        """
         if self._times and time_ns <= self._times[-1]:
             raise ModelError(
                 f"got an input at {time_ns} ns after one at {self._times[-1]} ns, expected times that"
                 " increase; leave out repeated samples"
+            )
+        before = self._times[-1] if self._times else self._start_ns
+        usual = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0
+        if time_ns - before > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * usual):
+            raise ModelError(
+                f"got an input {(time_ns - before) / NANOSECONDS:.3f} s after the last, expected no"
+                f" gap over {LONGEST_INPUT_GAP_S} s, for nothing is made up there; start a new stream"
+                " from a belief after the gap"
             )
         self._times.append(int(time_ns))
         self._values.append(np.asarray(value, float))

@@ -676,3 +676,19 @@ def test_find_lists_the_rooms(data_dir):
     if not (data_dir / "tumvi").is_dir():
         pytest.skip("no TUM-VI rooms beside the project")
     assert [path.name for path in asl.find(data_dir / "tumvi")] == list(ROOMS)
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, 9.81], [0.0, 9.81, 0.0], [0.0, 0.0, 1.0]])
+def test_gravity_is_as_assumed(tmp_path, up):
+    """A reference whose y points up, or an accelerometer in g, taken for what the layout assumes: the
+    estimate would fall by metres."""
+    times = [START + 5_000_000 * i for i in range(400)]
+    root = tmp_path / "V1_01" / "mav0"
+    stream(root, "imu0", table(IMU_HEADER, times, np.tile([0.0, 0.0, 0.0, *up], (400, 1))))
+    still = np.tile([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], (200, 1))
+    stream(root, "vicon0", table(POSE_HEADER, times[::2], still))
+    if up[2] > 9.0:
+        assert asl.load(root).info["gravity_ref"] == [0.0, 0.0, -9.81]
+        return
+    with pytest.raises(RecordingError, match=r"free fall of .* z points up"):
+        asl.load(root)

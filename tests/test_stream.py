@@ -74,7 +74,7 @@ def test_stream_is_a_batch_of_what_had_arrived(latency_s, shift_ns):
 
 
 def test_asking_seldom_changes_nothing():
-    """A window that overflows many times between two questions, or finality that depends on when one asks."""
+    """A window that overflows many times between questions; finality that depends on when one asks."""
     one = run(10, duration_s=6.0)
     often, events, put = live(one)
     seldom, _, _ = live(one)
@@ -111,3 +111,17 @@ def test_input_out_of_order_is_refused():
     stream.put_input(10, np.zeros(6))
     with pytest.raises(ModelError, match="increase"):
         stream.put_input(10, np.zeros(6))
+
+
+def test_nothing_is_made_up_in_a_gap():
+    """A hole in the input bridged without a word: in its middle, or before its first sample."""
+    one = run(9, duration_s=1.0)
+    stream, _, _ = live(one)
+    first = int(one.imu.time_ns[0])
+    with pytest.raises(ModelError, match=r"0\.3\d\d s after"):
+        stream.put_input(first + 350_000_000, np.zeros(6))
+    for i in range(3):
+        stream.put_input(first + 6_000_000 * i, np.zeros(6))
+    with pytest.raises(ModelError, match="made up"):
+        stream.put_input(first + 200_000_000, np.zeros(6))
+    stream.put_input(first + 80_000_000, np.zeros(6))

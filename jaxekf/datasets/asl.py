@@ -26,6 +26,7 @@ from jaxekf.datasets.columns import (
     stamps,
 )
 from jaxekf.errors import RecordingError
+from jaxekf.pose import gravity
 from jaxekf.recording import Floats, Imu, Optical, Recording, from_scipy, to_scipy, unit_quaternions
 
 _RATE_AND_FORCE = ("wx", "wy", "wz", "ax", "ay", "az")
@@ -37,6 +38,8 @@ _NOISE = (
     "accelerometer_random_walk",
 )
 _GRAVITY_REF = (0.0, 0.0, -9.81)
+_FARTHEST_GRAVITY = 1.0
+"""m/s^2: an accelerometer's bias is less, a wrong axis, unit or transform is more."""
 _WANTED = {
     "imu": "an IMU: a folder imu0, or one whose sensor.yaml says sensor_type: imu",
     "pose": "poses: a folder vicon0, mocap0 or state_groundtruth_estimate0, or one whose "
@@ -150,21 +153,39 @@ def load(
     sentences, all ``assumptions``.
 
     Raises `RecordingError`, which names file, line and column: for a stream that is not there,
-    cells that are not numbers, stamps that are not whole nanoseconds or do not increase, and a
-    ``T_BS`` that is not a rigid motion.
+    cells that are not numbers, stamps that are not whole nanoseconds or do not increase, a ``T_BS``
+    that is not a rigid motion, and where gravity, found from both streams, is not as assumed.
     """
     place = None if path is None else Path(path)
     imu_stream, pose_stream = _choose(place, imu, pose)
     inertial, tracked = _read(imu_stream, _RATE_AND_FORCE), _read(pose_stream, _POSE)
     # A flat pair is known by its prefix, however it was given.
     unnamed = place is None or place == imu_stream.file.parent
-    return Recording(
+    recording = Recording(
         _name(imu_stream.file if place is None or unnamed else place),
         optical=_optical(tracked, inertial.body_sensor.inverse().then(tracked.body_sensor)),
         imu=_imu(inertial),
         info=_info(inertial, tracked),
         path=place or imu_stream.file,
     )
+    _check_gravity(recording, pose_stream)
+    return recording
+
+
+def _check_gravity(recording: Recording, stream: Any) -> None:
+    """Raise where the accelerometer, turned by the poses, does not fall as the layout takes for granted."""
+    try:
+        found = gravity(recording.need_optical(), recording.need_imu(), stream.file)
+    except RecordingError:
+        return
+    if np.linalg.norm(found - _GRAVITY_REF) > _FARTHEST_GRAVITY:
+        raise RecordingError(
+            stream.file,
+            f"free fall of {np.round(found, 2).tolist()} m/s^2 by accelerometer and poses together",
+            f"about {list(_GRAVITY_REF)}",
+            "checking that the reference's z points up, the units (m/s^2, m, ns), the order of the"
+            " quaternion, T_BS and that both streams have one clock",
+        )
 
 
 # ---------------------------------------------------------------------------------------------

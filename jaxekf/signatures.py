@@ -13,6 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import uniform_filter1d
 
 from jaxekf import manifold
 from jaxekf.consistency import inflation, on_grid, whiten
@@ -23,6 +24,7 @@ from jaxekf.result import Estimate
 LATENCY, BIAS, MATRIX = slice(0, 1), slice(1, 4), slice(4, 13)
 _WIDE = np.array([10.0] + [10.0] * 3 + [10.0] * 9)
 """Deviations (s, rad/s, 1) of what faults may be at most: holds what a run cannot tell near zero."""
+_SMOOTH_S = 0.1
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,11 @@ class Faults:
         return float(size @ np.linalg.solve(self.cov[part, part], size))
 
     def effect(self, part: slice) -> float:
-        """Root mean square of what these leave in whitened innovations; noise has 1."""
+        """Root mean square of what these leave in whitened innovations, of which noise (at least that which
+        is expected) has 1."""
         size = self.size[part]
-        return float(np.sqrt(size @ self.information[part, part] @ size / max(self.rows, 1)))
+        square = size @ self.information[part, part] @ size / max(self.rows, 1)
+        return float(np.sqrt(square / max(float(np.nanmean(self.left**2)), 1.0)))
 
 
 def attitude_rows(estimate: Estimate, sensor: str) -> slice | None:
@@ -159,6 +163,9 @@ def _signatures(estimate: Estimate, time_ns: Times, gain: Floats, bias_gain: Flo
     clock = (estimate.time_ns - estimate.time_ns[0]) / NANOSECONDS
     rate, attitude = estimate.rate.value, to_scipy(estimate.attitude.value[at])
     turned = cumulative_trapezoid(rate, clock, axis=0, initial=0.0)[at]
+    # The gyroscope's own noise is in the innovations, too: what it looks like must not pass for latency.
+    window = max(1, round(_SMOOTH_S / max(float(np.median(np.diff(clock))), 1e-9)))
+    smooth = uniform_filter1d(rate, window, axis=0, mode="nearest")
     count = len(time_ns)
     dt = np.diff(time_ns) / NANOSECONDS
     turn = np.diff(turned, axis=0)
@@ -166,7 +173,7 @@ def _signatures(estimate: Estimate, time_ns: Times, gain: Floats, bias_gain: Flo
     pushed, moved = np.zeros((count, 3, 13)), np.zeros((count, 3, 13))
     pushed[1:, :, BIAS] = -dt[:, None, None] * eye
     pushed[1:, :, MATRIX] = np.einsum("ij,nk->nijk", eye, turn).reshape(count - 1, 3, 9)
-    moved[:, :, 0] = -rate[at]
+    moved[:, :, 0] = -smooth[at]
     carried = np.zeros((count, 3, 6))
     carried[1:, :, :3] = (attitude[1:].inv() * attitude[:-1]).as_matrix()
     carried[1:, :, 3:] = dt[:, None, None] * eye

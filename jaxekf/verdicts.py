@@ -46,7 +46,7 @@ class Fault:
     p: float
     """Probability of as much where there is none."""
     effect: float
-    """Root mean square of what it leaves in whitened innovations, in which noise leaves 1."""
+    """Root mean square of what it leaves in whitened innovations, of which noise leaves 1."""
 
 
 @dataclass(frozen=True)

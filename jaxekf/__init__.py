@@ -4,7 +4,9 @@ JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
 """
 
 from jaxekf import manifold, rotation, timeline
+from jaxekf.consistency import Consistency, Whiteness
 from jaxekf.datasets import demo
+from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
 from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
 from jaxekf.errors import (
     FilterError,
@@ -30,6 +32,7 @@ from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
 from jaxekf.storage import load, save
 from jaxekf.stream import Known, Stream
+from jaxekf.verdicts import Fault, Verdict
 
 __version__ = "0.1.0"
 
@@ -37,9 +40,12 @@ __all__ = [
     "SO3",
     "AdditiveQuaternion",
     "Belief",
+    "Consistency",
+    "Diagnosis",
     "Encoder",
     "Estimate",
     "Euclidean",
+    "Fault",
     "FilterError",
     "FilterOutput",
     "Imu",
@@ -62,12 +68,17 @@ __all__ = [
     "Samples",
     "Score",
     "Sensor",
+    "SensorDiagnosis",
     "SensorRecord",
     "SmootherOutput",
     "Start",
     "Stream",
     "TuningError",
+    "Verdict",
+    "Whiteness",
     "demo",
+    "diagnose",
+    "diagnose_many",
     "estimate",
     "estimate_many",
     "estimate_online",

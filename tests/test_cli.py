@@ -217,7 +217,8 @@ def test_what_a_table_would_hide_is_said(runs, tmp_path):
     result = call("estimate", tmp_path / "run", "--noise", noise, "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert "outside the run" in result.output
-    assert "times larger" in result.output
+    assert "optical noise is set too small" in result.output
+    assert "ms later" not in result.output and "ms earlier" not in result.output
 
 
 @pytest.mark.parametrize(

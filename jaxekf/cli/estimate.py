@@ -17,6 +17,7 @@ from jaxekf.cli.console import (
     print_json,
     print_table,
 )
+from jaxekf.diagnostics import Diagnosis, diagnose
 from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
 from jaxekf.files import check_output
@@ -24,8 +25,6 @@ from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
-
-_SUSPICIOUS_NIS = 3.0
 
 
 def load_runs(paths: Sequence[Path]) -> list[Recording]:
@@ -40,9 +39,9 @@ def load_runs(paths: Sequence[Path]) -> list[Recording]:
     return recordings
 
 
-def describe(made: Estimate, recording: Recording) -> dict[str, Any]:
-    """Summary of one estimate, with its score where there is an encoder."""
-    summary = made.summary()
+def describe(made: Estimate, recording: Recording, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Summary of one estimate, with what speaks against it and, where there is an encoder, its score."""
+    summary = made.summary() | {"diagnosis": diagnosis.as_dict()}
     if "bias" in {part.name for part in manifold.parts(made.model.space)}:
         summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
         summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
@@ -53,22 +52,16 @@ def describe(made: Estimate, recording: Recording) -> dict[str, Any]:
     return summary
 
 
-def warn(made: Estimate) -> None:
-    """Say what a table would hide: rows that fell outside the run, and noise that cannot be right."""
+def warn(made: Estimate, diagnosis: Diagnosis) -> None:
+    """Say what a table would hide: rows that fell outside the run, and whether it can be believed."""
     for name, count in made.account.items():
         if count.get("dropped_outside_run"):
             note(
                 f"{made.run}: {count['dropped_outside_run']} of {count['read']} samples of {name} lie"
                 " outside the run and were dropped"
             )
-    for text in made.notes:
+    for text in (*made.notes, *diagnosis.sentences(), *diagnosis.notes):
         note(f"{made.run}: {text}")
-    for name, record in made.sensors.items():
-        if len(record.nis) and made.mean_nis(name) > _SUSPICIOUS_NIS:
-            note(
-                f"{made.run}: innovations of {name} are {made.mean_nis(name):.0f} times larger (squared)"
-                " than the noise says: tune it, or the model does not fit this run"
-            )
 
 
 @click.command()
@@ -119,8 +112,9 @@ def estimate(
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         folder = made.save(output / recording.name, overwrite=overwrite)
-        summaries.append(describe(made, recording) | {"result": str(folder)})
-        warn(made)
+        diagnosis = diagnose(made, recording)
+        summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+        warn(made, diagnosis)
         note(f"wrote {folder}")
     if as_json:
         print_json({"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries})

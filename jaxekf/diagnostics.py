@@ -1,0 +1,232 @@
+"""Can an estimate be believed? Innovations and errors against what they are said to be, and why not.
+
+`diagnose` judges one run, `diagnose_many` several with the same model and noise together. Innovations
+tell without any truth: they are white, and as large as their covariance, where the filter is right.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from jaxekf import manifold
+from jaxekf.consistency import (
+    Consistency,
+    Whiteness,
+    judge_squares,
+    judge_whiteness,
+    whiten,
+)
+from jaxekf.metrics import attitude_error, normalised_square
+from jaxekf.recording import Flags, Floats, Recording
+from jaxekf.result import Estimate
+from jaxekf.signatures import BIAS, LATENCY, MATRIX, Faults, attitude_rows, find_faults
+from jaxekf.truth import encoder_at, encoder_rate_at, encoder_velocity_at
+from jaxekf.verdicts import (
+    Fault,
+    Verdict,
+    in_order,
+    judge_fault,
+    judge_part,
+    judge_sensor,
+    named_faults,
+    too_few,
+)
+
+_KINDS = {
+    "latency": (LATENCY, "s"),
+    "gyroscope_bias": (BIAS, "rad/s"),
+    "gyroscope_matrix": (MATRIX, "1"),
+}
+
+
+@dataclass(frozen=True)
+class SensorDiagnosis:
+    """What the innovations of one sensor tell."""
+
+    nis: Consistency
+    """Gated samples count."""
+    whiteness: Whiteness
+    faults: tuple[Fault, ...]
+    """Latency, gyroscope bias and matrix with their uncertainties, certain or not; of sensors of an
+    attitude only."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found on one run, or on several together."""
+
+    runs: tuple[str, ...]
+    sensors: dict[str, SensorDiagnosis]
+    parts: dict[str, Consistency]
+    """NEES of those outputs (attitude, rate, position, velocity) of which an encoder tells the truth."""
+    verdicts: tuple[Verdict, ...]
+    """What is wrong; empty where nothing speaks against the estimate."""
+    notes: tuple[str, ...]
+    """What could not be judged, and why."""
+
+    def sentences(self) -> tuple[str, ...]:
+        """Verdicts for a person; where there are none, the numbers that speak for the estimate."""
+        if self.verdicts:
+            return tuple(str(verdict) for verdict in self.verdicts)
+        told = [in_order(f"NIS of {n}", s.nis) for n, s in self.sensors.items() if s.nis.samples]
+        told += [
+            in_order(f"NEES of {name}", part) for name, part in self.parts.items() if part.samples
+        ]
+        return (f"nothing speaks against it: {'; '.join(told)}",) if told else ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: everything but the autocorrelation at each lag."""
+        return {
+            "runs": list(self.runs),
+            "verdicts": [_plain(verdict) for verdict in self.verdicts],
+            "notes": list(self.notes),
+            "sensors": {name: _plain(sensor) for name, sensor in self.sensors.items()},
+            "parts": {name: _plain(part) for name, part in self.parts.items()},
+        }
+
+
+def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosis:
+    """Judge one estimate by its innovations and, with a recording that has an encoder, by its errors.
+
+    Errors count at those instants whose nearest encoder sample is scored, as in `jaxekf.score`. Works for
+    every model; latency, gyroscope bias and matrix are looked for where a sensor measures an attitude and
+    the model puts out `attitude` and `rate`.
+    """
+    return diagnose_many([estimate], None if recording is None else [recording])
+
+
+def diagnose_many(
+    estimates: Sequence[Estimate], recordings: Sequence[Recording] | None = None
+) -> Diagnosis:
+    """As `diagnose`, of several runs together: smaller faults are found, each run keeping its own bias.
+
+    Raises `ValueError` for no estimates, or other recordings than the estimates' own.
+    """
+    _check(estimates, recordings)
+    names = list(dict.fromkeys(name for made in estimates for name in made.sensors))
+    sensors, verdicts, notes = {}, [], []
+    for name in names:
+        sensors[name], said = _judge_sensor(name, [e for e in estimates if name in e.sensors])
+        if note := too_few(name, sensors[name].nis):
+            notes.append(note)
+        else:
+            verdicts += said
+    parts = {}
+    for name, squares in _errors(estimates, recordings or []).items():
+        parts[name] = judge_squares(squares, [np.full(len(s), 3) for s in squares])
+        if note := too_few(f"NEES of {name}", parts[name], truth=True):
+            notes.append(note)
+        else:
+            verdicts += judge_part(name, parts[name])
+    runs = tuple(made.run for made in estimates)
+    return Diagnosis(runs, sensors, parts, tuple(verdicts), tuple(notes))
+
+
+def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None) -> None:
+    if not estimates:
+        raise ValueError(
+            "got no estimates, expected at least one; pass those of jaxekf.estimate_many"
+        )
+    if recordings is not None:
+        runs, given = [made.run for made in estimates], [r.name for r in recordings]
+        if runs != given:
+            raise ValueError(
+                f"got recordings {given} for estimates of {runs}, expected the same runs in the same"
+                " order; pass each estimate's own recording"
+            )
+
+
+def _judge_sensor(
+    name: str, estimates: Sequence[Estimate]
+) -> tuple[SensorDiagnosis, list[Verdict]]:
+    """Statistics of one sensor over several runs, and verdicts on them."""
+    records = [made.sensors[name] for made in estimates]
+    freedom = [(r.used | r.gated).sum(axis=1) for r in records]
+    nis = judge_squares([r.nis for r in records], freedom)
+    white = [whiten(r.residual, r.cov, r.used) for r in records]
+    times = [r.time_ns for r in records]
+    whiteness = judge_whiteness(times, white)
+    each = [find_faults(made, name) for made in estimates]
+    known = [found for found in each if found is not None and found.rows]
+    faults = _pooled(known)
+    diagnosis = SensorDiagnosis(nis, whiteness, faults)
+    named = named_faults(faults)
+    verdicts = [judge_fault(name, nis, fault) for fault in named]
+    if named:
+        rows = attitude_rows(estimates[0], name)
+        for i, found in enumerate(each):
+            if found is not None and rows is not None:
+                white[i] = white[i].copy()
+                white[i][:, rows] = found.left
+        left = [np.nansum(w**2, axis=1) for w in white]
+        nis = judge_squares(left, [np.isfinite(w).sum(axis=1) for w in white])
+        whiteness = judge_whiteness(times, white)
+    labels = manifold.error_labels(estimates[0].model.sensor(name).space)
+    memory = float(np.median([found.memory_s for found in known])) if known else None
+    rest = judge_sensor(name, nis, whiteness, labels=labels, memory_s=memory, explained=named)
+    return diagnosis, verdicts + rest
+
+
+def _pooled(found: Sequence[Faults]) -> tuple[Fault, ...]:
+    """Faults of several runs as one: latency and matrix shared, the bias each run's own."""
+    if not found:
+        return ()
+    total = sum(each.rows for each in found)
+    faults = []
+    for kind, (part, unit) in _KINDS.items():
+        if not all(part in each.judged for each in found):
+            continue
+        weights = [np.linalg.inv(each.cov[part, part]) for each in found]
+        cov = np.linalg.inv(np.sum(weights, axis=0))
+        sizes = [each.size[part] for each in found]
+        size = cov @ np.sum([w @ s for w, s in zip(weights, sizes, strict=True)], axis=0)
+        square, freedom = float(size @ np.linalg.solve(cov, size)), len(size)
+        if part == BIAS:
+            square, freedom = sum(each.wald(part) for each in found), freedom * len(found)
+        effect = np.sqrt(sum(each.rows * each.effect(part) ** 2 for each in found) / total)
+        sigma = np.sqrt(np.diagonal(cov))
+        p = float(chi2.sf(square, freedom))
+        faults.append(
+            Fault(kind, tuple(size.tolist()), tuple(sigma.tolist()), unit, p, float(effect))
+        )
+    return tuple(faults)
+
+
+def _errors(
+    estimates: Sequence[Estimate], recordings: Sequence[Recording]
+) -> dict[str, list[Floats]]:
+    """Normalised squares of the errors of each output of which there is truth, run by run."""
+    found: dict[str, list[Floats]] = {}
+    for made, recording in zip(estimates, recordings, strict=False):
+        if recording.encoder is None:
+            continue
+        truth = encoder_at(recording.encoder, made.time_ns)
+        errors: dict[str, Floats] = {}
+        if "attitude" in made.outputs:
+            errors["attitude"] = attitude_error(made.attitude.value, truth.q_ref_body)
+        if "rate" in made.outputs:
+            errors["rate"] = made.rate.value - encoder_rate_at(recording.encoder, made.time_ns)
+        if "position" in made.outputs and truth.position is not None:
+            errors["position"] = made.outputs["position"].value - truth.position
+        if "velocity" in made.outputs and truth.position is not None:
+            velocity = encoder_velocity_at(recording.encoder, made.time_ns)
+            errors["velocity"] = made.outputs["velocity"].value - velocity
+        for name, error in errors.items():
+            kept: Flags = truth.scored & np.isfinite(error).all(axis=1)
+            squares = normalised_square(error[kept], made.outputs[name].cov[kept])
+            found.setdefault(name, []).append(squares)
+    return found
+
+
+def _plain(node: Any) -> Any:
+    """A dataclass as what JSON knows, without curves."""
+    if isinstance(node, Consistency | Whiteness | Fault | Verdict | SensorDiagnosis):
+        curves = ("lag_s", "autocorrelation", "bound")
+        named = {f.name: getattr(node, f.name) for f in fields(node) if f.name not in curves}
+        return {key: _plain(value) for key, value in named.items()}
+    if isinstance(node, np.ndarray):
+        return node.tolist()
+    return [_plain(item) for item in node] if isinstance(node, tuple) else node

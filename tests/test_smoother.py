@@ -60,7 +60,7 @@ def test_linear_is_rauch_tung_striebel():
     assert np.all(variances <= np.diagonal(p, axis1=1, axis2=2) * (1 + 1e-12))
 
 
-@pytest.mark.parametrize("name", ["loose", "loose_additive", "tight", "triad", "visual"])
+@pytest.mark.parametrize("name", ["loose", "loose_additive", "tight", "triad"])
 def test_fast_is_naive(name):
     """The chart of an error lost on the way back, a substep skipped, a gate that opens, a constraint:
     models that have them, against a smoother that inverts what it must."""

@@ -92,15 +92,19 @@ def _epoch(
     return epochs.over_substeps_back(substep, info, (every, fast), slow)
 
 
+def lessened(p: Array, matrix: Array) -> Array:
+    """``P - P L P``."""
+    lost = loop(algebra.product, p, loop(algebra.product, matrix, p))
+    return loop(lambda p, lost: linalg.symmetrise(p - lost), p, lost)
+
+
 def smoothed(
     system: System, prepared: Any, belief: Belief, info: Information, *, adjoint: bool
 ) -> Belief:
     """The belief of the filter with what came later."""
     p = belief.cov
     delta = loop(algebra.apply, p, info.vector)
-    through = loop(algebra.product, info.matrix, p)
-    lost = loop(algebra.product, p, through)
-    cov = loop(lambda p, lost: linalg.symmetrise(p - lost), p, lost)
+    cov = lessened(p, info.matrix)
     correction = system.correction
     always = jnp.ones(p.shape[-1], bool)
     mean, reset, _ = correction.piece(

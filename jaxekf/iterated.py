@@ -299,8 +299,7 @@ def _moved(
     """A state of the path moved to where it is most probable, its covariance counted from there, and how
     many standard deviations it moved."""
     delta = delta + loop(algebra.apply, cov, info.vector)
-    lost = loop(algebra.product, cov, loop(algebra.product, info.matrix, cov))
-    cov = loop(lambda p, lost: linalg.symmetrise(p - lost), cov, lost)
+    cov = backward.lessened(cov, info.matrix)
     longest = lax.stop_gradient(jnp.max(jnp.abs(delta) / jnp.sqrt(linalg.diagonal(cov)), axis=0))
     moved, turned = system.move(prepared["move"], mean, delta, adjoint=adjoint)
     return Belief(moved, _turned(turned, cov)), longest

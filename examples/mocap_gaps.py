@@ -27,15 +27,19 @@ from rich.progress import Progress  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 import jaxekf  # noqa: E402
+from jaxekf import synchronise  # noqa: E402
 from jaxekf.datasets import asl  # noqa: E402
 from jaxekf.models import loose_pose  # noqa: E402
 from jaxekf.parameters import as_arrays  # noqa: E402
-from jaxekf.recording import Flags, Floats, Times, to_scipy  # noqa: E402
+from jaxekf.recording import Flags, Floats, Optical, Times, to_scipy  # noqa: E402
 
-SETTLE_S, BETWEEN_S, FIT_S = 8.0, 3.0, 0.05
+SETTLE_S, BETWEEN_S = 8.0, 3.0
+FIT_S, FIT_FRAMES = 0.05, 3
 STEP_DEG, STEP_M = 1.0, 0.05
 """A step from one frame to the next that differs by more from the gyroscope's, or is longer, is an
 outlier."""
+KNOWN_DEG = 0.3
+"""An alignment is corrected where it is known better than this."""
 METHODS = ("estimate", "hold last", "constant velocity")
 
 
@@ -57,9 +61,10 @@ class Case(NamedTuple):
 
 
 def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
-    """Noise of a small MEMS IMU and of motion capture, the same for all; no number is tuned to a room.
+    """Noise of a small MEMS IMU and of motion capture, the same for all: none of it is tuned to a room.
 
-    Densities are several times a data sheet's: scale, alignment and timing are not calibrated here.
+    Densities are several times a data sheet's: the gyroscope's scale and the lever arm are not calibrated
+    here. Clock and alignment are, from the poses that can be seen, where they turn enough to tell.
     """
     params = loose_pose.MODEL.parameters
     noise = params.noise._replace(
@@ -70,7 +75,16 @@ def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
         position=1e-3,
         optical=np.deg2rad(0.2),
     )
-    return as_arrays(params._replace(noise=noise))
+    calibration = params.calibration
+    try:
+        found = synchronise.match(recording.need_optical(), recording.need_imu(), recording.name)
+    except jaxekf.RecordingError as error:
+        print(f"clock and alignment are taken as stated: {error}", file=sys.stderr)
+    else:
+        calibration = calibration._replace(latency=np.array(found.latency_s))
+        if found.alignment_sigma.max() < np.deg2rad(KNOWN_DEG):
+            calibration = calibration._replace(alignment=found.alignment)
+    return as_arrays(params._replace(noise=noise, calibration=calibration))
 
 
 def turning_off(recording: jaxekf.Recording) -> Floats:
@@ -86,11 +100,13 @@ def turning_off(recording: jaxekf.Recording) -> Floats:
 
 
 def good_frames(recording: jaxekf.Recording) -> Flags:
-    """Frames that agree with both neighbours: where the motion capture can be believed."""
+    """Frames that agree with both neighbours and do not repeat one: where the motion capture can be
+    believed."""
     optical = recording.need_optical()
     assert optical.position is not None
     step_m = np.linalg.norm(np.diff(optical.position, axis=0), axis=1)
-    calm = (turning_off(recording) < STEP_DEG) & (step_m < STEP_M)
+    frozen = (step_m == 0.0) & (np.diff(optical.q_ref_body, axis=0) == 0.0).all(axis=1)
+    calm = (turning_off(recording) < STEP_DEG) & (step_m < STEP_M) & ~frozen
     good = optical.valid.copy()
     good[1:] &= calm
     good[:-1] &= calm
@@ -119,18 +135,25 @@ def hide(recording: jaxekf.Recording, length_s: float) -> Case:
     return Case(recording.name, length_s, gaps, recording, changed)
 
 
+def tracked_pose(made: jaxekf.Estimate, optical: Optical, at: Any) -> tuple[Floats, Rotation]:
+    """What the motion capture should have said at these instants: its point, and its own frame."""
+    turn = to_scipy(made.attitude.value[at])
+    point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
+    frame = Rotation.from_rotvec(np.asarray(made.params.calibration.alignment))
+    return made.outputs["position"].value[at] + turn.apply(point), turn * frame
+
+
 def predictions(case: Case, made: jaxekf.Estimate, gap: Gap) -> dict[str, tuple[Floats, Rotation]]:
     """Position of the tracked point and attitude at the end of a stretch, by each method."""
     optical = case.original.need_optical()
     assert optical.position is not None
     at = int(np.searchsorted(made.time_ns, optical.time_ns[gap.end] - optical.latency_ns))
-    turn = to_scipy(made.attitude.value[at])
-    point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
-    found = {"estimate": (made.outputs["position"].value[at] + turn.apply(point), turn)}
+    found = {"estimate": tracked_pose(made, optical, at)}
     last = optical.position[gap.before], to_scipy(optical.q_ref_body[gap.before])
     found["hold last"] = last
     t = (optical.time_ns - optical.time_ns[gap.before]) / 1e9
-    chosen = np.flatnonzero((t >= -FIT_S) & (t <= 0.0) & optical.valid)
+    back = max(FIT_S, (FIT_FRAMES - 0.5) * float(np.median(np.diff(t))))
+    chosen = np.flatnonzero((t >= -back) & (t <= 0.0) & optical.valid)
     speed = np.polyfit(t[chosen], optical.position[chosen], 1)[0]
     vectors = (last[1].inv() * to_scipy(optical.q_ref_body[chosen])).as_rotvec()
     rate = np.polyfit(t[chosen], vectors, 1)[0]
@@ -162,9 +185,8 @@ def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, An
     good = good_frames(recording)
     at = _nearest(made.time_ns, optical.time_ns - optical.latency_ns)
     inside = (optical.time_ns >= made.time_ns[0] + int(1e9)) & (optical.time_ns <= made.time_ns[-1])
-    turn = to_scipy(made.attitude.value[at])
-    point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
-    off = made.outputs["position"].value[at] + turn.apply(point) - optical.position
+    point, turn = tracked_pose(made, optical, at)
+    off = point - optical.position
     angle = np.rad2deg((turn.inv() * to_scipy(optical.q_ref_body)).magnitude())
     judged = good & inside
     seen = optical.valid & inside
@@ -265,11 +287,12 @@ def main() -> None:
     with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("recordings", total=len(recordings))
         for recording in recordings:
-            params = parameters_of(recording)
             cases = [hide(recording, length) for length in arguments.hide]
             runs = [recording, *(case.hidden for case in cases)]
             try:
-                whole, *found = jaxekf.estimate_many(runs, "loose_pose", params)
+                whole, *found = [
+                    jaxekf.estimate(run, "loose_pose", parameters_of(run)) for run in runs
+                ]
             except jaxekf.JaxekfError as error:
                 print(f"left out: {error}", file=sys.stderr)
                 failed.append(recording.name)

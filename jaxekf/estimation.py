@@ -23,6 +23,8 @@ from jaxekf.timeline import Steps, Timeline
 
 Run = Recording | Path | str
 _BATCH_BYTES = 1 << 30
+_MANY_REFUSED = 0.2
+"""A gate that refuses a larger share of a sensor's samples is worth a word."""
 
 
 def require_float64() -> None:
@@ -227,6 +229,7 @@ def _collect(
 
     belief: Belief = jax.tree.map(flat, output.instants.updated)
     sensors, account = {}, {name: dict(count) for name, count in line.account.items()}
+    refused: tuple[str, ...] = ()
     for name in model_sensors(line):
         fast = name in line.steps.fast
         rows = (line.steps.fast if fast else line.steps.slow)[name]
@@ -235,11 +238,17 @@ def _collect(
         if name in account:
             rejected = int((record.gated.any(axis=1) & ~record.used.any(axis=1)).sum())
             account[name]["gated"] = rejected
-            account[name]["used"] = account[name].pop("fed") - rejected
+            fed = account[name].pop("fed")
+            account[name]["used"] = fed - rejected
+            if rejected > _MANY_REFUSED * fed:
+                refused += (
+                    f"the gate refused {rejected} of {fed} samples of {name}, far more than chance does:"
+                    " look for wrong noise, geometry, names, units or latency",
+                )
     for count in account.values():
         if "fed" in count:
             count["used"] = count.pop("fed")
-    notes = line.notes
+    notes = line.notes + refused
     if output.instants.recovered is not None and (opened := flat(output.instants.recovered)).any():
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
         notes += (

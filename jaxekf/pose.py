@@ -20,6 +20,14 @@ from jaxekf.recording import (
 )
 from jaxekf.truth import encoder_at
 
+START_FIT = 4.0
+"""A run does not start from a frame whose markers fit the tool this much worse than the median."""
+_LARGEST_MISFIT = 0.1
+"""Markers that lie off the tool by more than this share of its size are not those of the tool."""
+_START_S = 1.0
+_START_TURN = 6.0
+_LEAST_TURN = 1e-3
+_LARGEST_SPEED = 3.0
 _LEAST_MARKERS = 3
 _LEAST_SPREAD = 0.05
 """Markers are on a line where they are this much flatter than long."""
@@ -73,9 +81,34 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
     return Fit(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
 
 
-def from_markers(markers: Markers) -> Optical:
-    """The raw pose a tracker would report for its markers, frame by frame, without any filter."""
+def fit_markers(markers: Markers, place: object) -> Fit:
+    """The rigid fit of every frame; raises `RecordingError` where the markers are not those of the tool.
+
+    Whatever noise there is, it is small beside the tool: a larger misfit is a wrong unit, wrong names,
+    or the geometry of another tool.
+    """
     fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
+    if not fit.valid.any():
+        return fit
+    size = float(np.ptp(markers.p_body_marker, axis=0).max())
+    off = float(np.median(fit.error[fit.valid]))
+    if off > _LARGEST_MISFIT * size:
+        raise RecordingError(
+            str(place),
+            f"markers that lie {off:.3g} m off a tool of {size:.3g} m, whatever its pose",
+            f"at most {_LARGEST_MISFIT * size:.2g} m",
+            "metres in markers.csv and in its geometry, and each marker under its own name",
+        )
+    return fit
+
+
+def from_markers(markers: Markers, fit: Fit | None = None) -> Optical:
+    """The raw pose a tracker would report for its markers, frame by frame, without any filter.
+
+    `fit` is that of `fit_markers`, where it is known already.
+    """
+    if fit is None:
+        fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
     return Optical(
         markers.time_ns,
         fit.q_ref_body,
@@ -95,6 +128,36 @@ def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Flo
     if step > _LONGEST_STEP_S:
         return np.zeros(3)
     return (position[second] - position[first]) / step
+
+
+def first_steady(optical: Optical, imu: Imu) -> int | None:
+    """The valid pose to start from: the first of those of the first second that turns to the next as the
+    gyroscope did, and does not jump; where none does, the first of all. None where no pose is valid.
+
+    A tracker that has just found its tool may begin with a wrong pose, which no later one corrects for as
+    long as gates refuse what does not fit.
+    """
+    seen = np.flatnonzero(optical.valid)
+    if seen.size == 0:
+        return None
+    times = optical.time_ns[seen] - optical.latency_ns
+    span = np.diff(times) / NANOSECONDS
+    known = (imu.time_ns - times[0]) / NANOSECONDS
+    middle = (times[:-1] - times[0]) / NANOSECONDS + 0.5 * span
+    rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
+    turn = to_scipy(optical.q_ref_body[seen])
+    said = Rotation.from_rotvec(rate * span[:, None])
+    off = (said.inv() * turn[:-1].inv() * turn[1:]).magnitude()
+    near = span <= _LONGEST_STEP_S
+    if not near.any():
+        return int(seen[0])
+    good = near & (off <= max(_LEAST_TURN, _START_TURN * float(np.median(off[near]))))
+    if optical.position is not None:
+        good &= np.linalg.norm(np.diff(optical.position[seen], axis=0), axis=1) <= (
+            _LARGEST_SPEED * span
+        )
+    good &= times[:-1] - times[0] <= _START_S * NANOSECONDS
+    return int(seen[np.argmax(good)]) if good.any() else int(seen[0])
 
 
 def gravity(optical: Optical, imu: Imu, place: object) -> Floats:

@@ -92,8 +92,14 @@ class Stream:
                 f" gap over {LONGEST_INPUT_GAP_S} s, for nothing is made up there; start a new stream"
                 " from a belief after the gap"
             )
+        sample = np.asarray(value, float)
+        if self._values and sample.shape != self._values[0].shape:
+            raise ModelError(
+                f"got an input of shape {sample.shape}, expected {self._values[0].shape} as before; put"
+                " every sample in whole"
+            )
         self._times.append(int(time_ns))
-        self._values.append(np.asarray(value, float))
+        self._values.append(sample)
 
     def put(
         self, sensor: str, taken_ns: int, value: Any, *, mask: Any = True, aux: Any = None
@@ -104,6 +110,7 @@ class Stream:
         if late:
             self.dropped[sensor] += 1
             return False
+        _check_shapes(found, value)
         rows = np.broadcast_to(np.asarray(mask, bool), found.rows)
         aux = found.aux_like if aux is None else aux
         self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
@@ -186,6 +193,17 @@ class Stream:
         """Seconds between the sensor's open samples; only a gate's patience counts them."""
         times = sorted(t for t, s in self._samples.items() if sensor in s)
         return float(np.median(np.diff(times))) / NANOSECONDS if len(times) > 1 else 0.0
+
+
+def _check_shapes(sensor: Sensor, value: Any) -> None:
+    """Raise `ModelError` for a sample that is not of the sensor's space."""
+    expected = [np.shape(leaf) for leaf in jax.tree.leaves(_blank(sensor.space))]
+    got = [np.shape(leaf) for leaf in jax.tree.leaves(value)]
+    if got != expected:
+        raise ModelError(
+            f"sensor '{sensor.name}': got a sample of shapes {got}, expected {expected}; give it as the"
+            " sensor's space has it"
+        )
 
 
 def _blank(space: Any) -> Any:

@@ -15,7 +15,7 @@ ORDER = [
     ("errors",),
     ("rotation", "linalg", "recording", "files"),
     ("manifold", "tables", "truth", "description"),
-    ("model", "pose", "marker_storage", "encoder_storage"),
+    ("model", "pose", "synchronise", "marker_storage", "encoder_storage"),
     ("timeline",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),

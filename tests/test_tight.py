@@ -316,3 +316,31 @@ def test_a_start_does_not_trust_an_outlier(frame):
     good, found = timeline.build(model, one).first, timeline.build(model, spoilt).first
     np.testing.assert_allclose(found["position"], good["position"], atol=0.01)
     np.testing.assert_allclose(found["velocity"], good["velocity"], atol=0.2)
+
+
+@pytest.mark.parametrize("model", ["tight", "loose_pose"])
+def test_markers_of_another_unit_are_refused(model):
+    """Millimetres where metres belong: without a word the filter starts 100 m from its tool."""
+    one = run(5, duration_s=0.5)
+    spoilt = one.replace(markers=replace(one.markers, position=1e3 * one.markers.position))
+    with pytest.raises(RecordingError, match="off a tool of"):
+        timeline.build(
+            jaxekf.get_model(model).adapt([spoilt])
+            if model == "tight"
+            else jaxekf.get_model(model),
+            spoilt,
+        )
+
+
+def test_a_pose_to_start_from_turns_as_the_gyroscope_did():
+    """A first pose 20 deg off: gates then refuse every good one until the belief is widened."""
+    one = run(6, duration_s=1.0)
+    poses = pose.from_markers(one.markers)
+    wrong = poses.q_ref_body.copy()
+    wrong[:2] = wrong[:2] @ np.diag([0.98, 1.0, 1.0, 1.0]) + [0.0, 0.17, 0.0, 0.0]
+    wrong[:2] /= np.linalg.norm(wrong[:2], axis=1)[:, None]
+    spoilt = one.replace(markers=None, optical=replace(poses, q_ref_body=wrong))
+    spoilt.optical.q_ref_body[1] = poses.q_ref_body[1]
+    built = timeline.build(jaxekf.get_model("loose_pose"), spoilt)
+    np.testing.assert_array_equal(built.first["q_ref_body"], poses.q_ref_body[1])
+    assert "poses at the start" in built.notes[0]

@@ -16,7 +16,7 @@ from jaxekf import linalg, pose, rotation
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.models import inertial, sources
-from jaxekf.recording import Optical, Recording, Samples
+from jaxekf.recording import Flags, Optical, Recording, Samples, Times
 
 GATE = 0.999
 
@@ -91,20 +91,40 @@ def _setup(recording: Recording) -> Setup:
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first visible pose."""
+    """The first visible pose that can be believed (`pose.first_steady`; of single markers also one that
+    fits the tool); what came before is dropped."""
     seen = samples["optical"]
-    valid = np.asarray(seen.mask.all(axis=1))
-    if not valid.any():
-        return None
-    first = int(np.argmax(valid))
+    visible = np.asarray(seen.mask.all(axis=1))
+    if recording.optical is None and recording.markers is not None:
+        visible &= _fits(recording, seen.time_ns)
     arm = _tracked_point(recording)
     origin = seen.value.position - sources.turned(seen.value.q_ref_body, arm)
+    poses = Optical(seen.time_ns, seen.value.q_ref_body, visible, origin)
+    first = pose.first_steady(poses, recording.need_imu())
+    if first is None:
+        return None
+    skipped = int(visible[:first].sum())
     known = {
         "position": origin[first],
         "q_ref_body": seen.value.q_ref_body[first],
-        "velocity": pose.velocity_at(seen.time_ns, origin, valid, first),
+        "velocity": pose.velocity_at(seen.time_ns, origin, visible, first),
     }
-    return Start(int(seen.time_ns[first]), known)
+    note = (
+        f"{skipped} poses at the start do not turn as the gyroscope did, or jump: they are not used"
+        if skipped
+        else ""
+    )
+    return Start(int(seen.time_ns[first]), known, note)
+
+
+def _fits(recording: Recording, taken: Times) -> Flags:
+    """Of the poses taken then, those whose markers fit the tool as well as others do."""
+    markers = recording.need_markers()
+    fit = pose.fit_markers(markers, recording.path or recording.name)
+    chosen = np.isin(markers.time_ns - markers.latency_ns, taken)
+    error, valid = fit.error[chosen], fit.valid[chosen]
+    limit = pose.START_FIT * np.median(error[valid]) if valid.any() else 0.0
+    return valid & (error <= limit)
 
 
 def _tracked_point(recording: Recording) -> Any:

@@ -20,8 +20,6 @@ from jaxekf.models import inertial, sources
 from jaxekf.recording import NANOSECONDS, Recording, Samples
 
 GATE = 0.999
-START_FIT = 4.0
-"""A run does not start from a frame whose markers fit the tool this much worse than the median."""
 
 
 class Noise(NamedTuple):
@@ -96,13 +94,13 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     """The first frame in which three markers, not on a line, give a pose; what came before is dropped."""
     times = next(iter(samples.values())).time_ns
     markers = sources.single_markers(recording)
-    raw = pose.from_markers(markers)
+    fit = pose.fit_markers(markers, recording.path or recording.name)
+    raw = pose.from_markers(markers, fit)
     inside = np.isin(raw.time_ns - raw.latency_ns, times)
     valid = raw.valid & inside
     if not valid.any() or raw.position is None:
         return None
-    fit = pose.absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
-    valid &= fit.error <= START_FIT * np.median(fit.error[valid])
+    valid &= fit.error <= pose.START_FIT * np.median(fit.error[valid])
     first = int(np.argmax(valid))
     taken = raw.time_ns - raw.latency_ns
     waited = (taken[first] - times[0]) / NANOSECONDS

@@ -17,6 +17,7 @@ from jaxekf.errors import (
     TuningError,
 )
 from jaxekf.estimation import estimate, estimate_many
+from jaxekf.export import read_export
 from jaxekf.interpolation import InputSample
 from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
 from jaxekf.kernels import jit
@@ -88,6 +89,7 @@ __all__ = [
     "load",
     "load_parameters",
     "manifold",
+    "read_export",
     "rotation",
     "run_filter",
     "run_filter_batch",

@@ -1,7 +1,9 @@
 """Output that is written whole or not at all."""
 
+import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -45,14 +47,34 @@ def whole_folder(path: Path | str, marker: str, *, overwrite: bool = False) -> A
         raise
 
 
+@contextmanager
+def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary file beside `path` that becomes it when the block ends well, and is gone if not.
+
+    Raises `RecordingError` for a path that exists; with `overwrite` only where it is no file.
+    """
+    target = Path(path)
+    if target.exists() and not (overwrite and target.is_file()):
+        got, hint = "a folder", "the name of a file"
+        if target.is_file():
+            got, hint = "a file that exists", "another path or the overwrite option"
+        raise RecordingError(target, got, "a new file", hint)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(
+        prefix=f".{target.name}-", suffix=target.suffix, dir=target.parent
+    )
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        temporary.replace(target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
 def write_whole(path: Path | str, text: str) -> None:
     """Write a text file by a temporary one and a rename, so that it is never half there."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=target.parent, prefix=f".{target.name}-", delete=False
-    ) as file:
-        temporary = Path(file.name)
-        file.write(text)
-    temporary.chmod(0o644)
-    temporary.replace(target)
+    with whole_file(path, overwrite=True) as temporary:
+        temporary.write_text(text, "utf-8")

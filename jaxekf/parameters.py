@@ -59,6 +59,21 @@ def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> 
     return document
 
 
+def described_arrays(model: Model, params: Parameters) -> dict[str, tuple[Any, str]]:
+    """Each parameter as an array with its unit, by ``section/name``.
+
+    The setup, which a recording tells, has no units in a model: it is in SI units.
+    """
+    found = {}
+    for section in (*_SECTIONS, "setup"):
+        values, units = getattr(params, section), getattr(model.units, section)
+        names, leaves = leaf_names(values), jax.tree.leaves(values)
+        said = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
+        for name, leaf, unit in zip(names, leaves, said, strict=True):
+            found[f"{section}/{name}"] = (np.asarray(leaf), unit)
+    return found
+
+
 def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]) -> None:
     """Write `noise.toml` (noise and initial belief) and `calibration.toml` into a folder, each whole.
 

@@ -1,7 +1,7 @@
 """What an estimate is on the host: named arrays with units and frames, and how it is written."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxekf import manifold, parameters
-from jaxekf.files import whole_folder
+from jaxekf import export, manifold, parameters
+from jaxekf.errors import ModelError
+from jaxekf.export import Entry
+from jaxekf.files import whole_file, whole_folder
+from jaxekf.manifold import Manifold
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import NANOSECONDS, Floats, Times
 from jaxekf.storage import SCHEMA_VERSION
@@ -138,17 +141,39 @@ class Estimate:
             "notes": list(self.notes),
         }
 
-    def save(self, path: Path | str, *, overwrite: bool = False) -> Path:
+    def export(self, path: Path | str, *, overwrite: bool = False) -> Path:
+        """Write one file, whole or not at all, in the format of its suffix. Returns its path.
+
+        ``.csv`` is `estimate.csv` of the result folder: state, outputs, standard deviations, rounded to 12
+        digits. ``.npz`` and ``.h5`` or ``.hdf5`` hold everything to the last bit, see
+        `jaxekf.read_export`. ``.tum`` is the trajectory in the TUM format, ``timestamp tx ty tz qx qy qz
+        qw``: the recording's time in seconds, exact to the nanosecond, the position (zero for a model
+        without one) and the attitude, body to reference, scalar last.
+
+        Raises `RecordingError` for another suffix and, without `overwrite`, for a file that exists;
+        `ModelError` for a trajectory of a model without attitude.
+        """
+        form = export.format_of(path)
+        with whole_file(path, overwrite=overwrite) as file:
+            self._write(form, file)
+        return Path(path)
+
+    def save(
+        self, path: Path | str, *, overwrite: bool = False, exports: Iterable[str] = ()
+    ) -> Path:
         """Write the result folder, whole or not at all.
 
         ``estimate.csv`` state, outputs and standard deviations; ``covariance.npz`` full matrices;
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
-        account and provenance.
+        account and provenance. `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
+        `estimate.h5`, ``tum`` `trajectory.tum`.
         """
+        added = export.files_of(path, exports)
         with whole_folder(path, "result.json", overwrite=overwrite) as folder:
-            columns, values = self._table()
-            names = [column["name"] for column in columns]
-            write_csv(folder / "estimate.csv", names, self.time_ns, values, 12)
+            columns, _ = self._table()
+            self._write("csv", folder / "estimate.csv")
+            for form, name in added.items():
+                self._write(form, folder / name)
             self._save_covariance(folder / "covariance.npz")
             for name, record in self.sensors.items():
                 labels = manifold.error_labels(self.model.sensor(name).space)
@@ -166,6 +191,74 @@ class Estimate:
             text = json.dumps(document, indent=2, allow_nan=False)
             (folder / "result.json").write_text(text + "\n", "utf-8")
         return Path(path)
+
+    def _write(self, form: str, file: Path) -> None:
+        """One file in a format of `export`."""
+        if form == "csv":
+            columns, values = self._table()
+            write_csv(file, [column["name"] for column in columns], self.time_ns, values, 12)
+        elif form == "tum":
+            if "attitude" not in self.outputs:
+                raise ModelError(
+                    f"model '{self.model.name}' got a trajectory to write without the output 'attitude',"
+                    " expected one; give the model that output, or export another format"
+                )
+            place = self.outputs.get("position")
+            comments = [f"run {self.run}, model {self.model.name}"]
+            position = None if place is None else place.value
+            export.write_tum(file, self.time_ns, self.attitude.value, position, comments)
+        else:
+            {"npz": export.write_npz, "hdf5": export.write_hdf5}[form](file, self._entries())
+
+    def _entries(self) -> dict[str, Entry]:
+        """All of the estimate, by the paths of an NPZ or HDF5 file."""
+        facts = {
+            "kind": export.KIND,
+            "schema_version": SCHEMA_VERSION,
+            "run": self.run,
+            "model": self.model.name,
+            "smoothed": self.smoothed,
+            "log_likelihood": self.log_likelihood,
+        }
+        found = {"": Entry(None, facts), "time_ns": Entry(self.time_ns, {"unit": "ns"})}
+        space = self.model.space
+        parts = manifold.parts(space)
+        for part, leaf in zip(parts, jax.tree.leaves(self.state), strict=True):
+            found[f"state/{part.name}"] = Entry(np.asarray(leaf), _stored(part.manifold, ""))
+        frames = [part.manifold.frame for part in parts for _ in range(part.manifold.dim)]
+        about: dict[str, Any] = {"labels": list(self.error_labels), "frames": frames}
+        about["units"] = list(manifold.error_units(space))
+        found["covariance"] = Entry(np.asarray(self.cov), about)
+        for name, output in self.outputs.items():
+            kind = manifold.parts(self.model.output(name).space)[0].manifold
+            head = f"outputs/{name}"
+            found[f"{head}/value"] = Entry(np.asarray(output.value), _stored(kind, output.frame))
+            about = {"unit": f"({output.unit})^2", "frame": output.frame}
+            about["labels"] = list(kind.error_labels)
+            found[f"{head}/covariance"] = Entry(np.asarray(output.cov), about)
+        for name, record in self.sensors.items():
+            found |= self._sensor_entries(name, record)
+        for name, (value, unit) in parameters.described_arrays(self.model, self.params).items():
+            found[f"parameters/{name}"] = Entry(value, {"unit": unit})
+        found["notes"] = Entry(list(self.notes))
+        found |= _leaves("account", self.account) | _leaves("provenance", self.provenance)
+        return found
+
+    def _sensor_entries(self, name: str, record: SensorRecord) -> dict[str, Entry]:
+        space = self.model.sensor(name).space
+        parts = manifold.parts(space)
+        about = {
+            "labels": list(manifold.error_labels(space)),
+            "units": list(manifold.error_units(space)),
+            "frames": [part.manifold.frame for part in parts for _ in range(part.manifold.dim)],
+        }
+        said = {"time_ns": {"unit": "ns"}, "residual": about, "cov": about, "nis": {"unit": "1"}}
+        columns = {"time_ns": "time_ns", "residual": "residual", "cov": "covariance"}
+        columns |= {key: key for key in ("used", "gated", "nis")}
+        return {
+            f"sensors/{name}/{path}": Entry(np.asarray(getattr(record, key)), said.get(key, {}))
+            for key, path in columns.items()
+        }
 
     def _table(self) -> tuple[list[dict[str, str]], Floats]:
         """Columns of `estimate.csv`, with unit and frame, and their values."""
@@ -201,6 +294,26 @@ class Estimate:
         )
 
 
+def _stored(kind: Manifold, frame: str) -> dict[str, Any]:
+    """Unit, frame and labels of stored numbers; of a quaternion, from where to where it rotates.
+
+    Without a `frame` the manifold's own is taken.
+    """
+    seen = frame or kind.frame
+    unit, seen = (kind.unit, seen) if kind.shape == (kind.dim,) else ("1", f"{seen} to reference")
+    return {"unit": unit, "frame": seen, "labels": list(kind.component_labels)}
+
+
+def _leaves(path: str, node: Any) -> dict[str, Entry]:
+    """Nested mappings as entries; what neither format has, such as None, as JSON."""
+    if isinstance(node, Mapping):
+        return {
+            at: entry for key in node for at, entry in _leaves(f"{path}/{key}", node[key]).items()
+        }
+    plain = isinstance(node, str | bool | int | float)
+    return {path: Entry(node if plain else json.dumps(node))}
+
+
 def _describe(name: str, space: Any, frame: str) -> list[dict[str, str]]:
     """Name, unit and frame of the columns of a state or output: its numbers, then their sigmas.
 
@@ -211,10 +324,10 @@ def _describe(name: str, space: Any, frame: str) -> list[dict[str, str]]:
     for part in manifold.parts(space):
         for label in part.manifold.component_labels:
             whole = "_".join(filter(None, (part.name, label)))
-            quaternion = part.manifold.shape != (part.manifold.dim,)
-            own = frame or part.manifold.frame
-            unit, seen = ("1", "body to reference") if quaternion else (part.manifold.unit, own)
-            columns.append({"name": f"{head}{whole}", "unit": unit, "frame": seen})
+            about = _stored(part.manifold, frame)
+            columns.append(
+                {"name": f"{head}{whole}", "unit": about["unit"], "frame": about["frame"]}
+            )
     frames = [
         frame or p.manifold.frame for p in manifold.parts(space) for _ in range(p.manifold.dim)
     ]

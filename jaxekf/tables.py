@@ -218,11 +218,11 @@ def flags(table: Table, name: str) -> NDArray[np.bool_]:
     return finite_numbers(table, (name,))[:, 0] != 0.0
 
 
-def format_seconds(time_ns: int) -> str:
-    """Nanoseconds as decimal seconds, exactly, without trailing zeros."""
+def format_seconds(time_ns: int, decimals: int = 0) -> str:
+    """Nanoseconds as decimal seconds, exactly; trailing zeros only to fill so many `decimals`."""
     sign, size = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
     whole, part = divmod(int(size), NANOSECONDS)
-    digits = f"{part:09d}".rstrip("0")
+    digits = f"{part:09d}".rstrip("0").ljust(decimals, "0")
     return f"{sign}{whole}.{digits}" if digits else f"{sign}{whole}"
 
 

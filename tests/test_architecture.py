@@ -15,7 +15,7 @@ ORDER = [
     ("errors",),
     ("rotation", "linalg", "recording", "files"),
     ("manifold", "tables", "truth", "description"),
-    ("model", "pose", "synchronise", "marker_storage", "encoder_storage"),
+    ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export"),
     ("timeline",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),
@@ -97,10 +97,12 @@ def test_imports_run_one_way(file):
 
 @pytest.mark.parametrize("file", FILES, ids=module_name)
 def test_who_may_know_what(file):
-    """Would catch matplotlib outside plots, optax outside tuning, and tuning outside the command line."""
+    """Would catch matplotlib outside plots, optax outside tuning, HDF5 outside exports, and tuning outside
+    the command line."""
     name, tops = module_name(file), {m.split(".")[0] for m in imports(file)}
     assert "matplotlib" not in tops or name.split(".")[0] == "plots"
     assert "optax" not in tops
+    assert "h5py" not in tops or name == "export"
     assert "tuning" not in tops or name.startswith("cli")
     assert not ({"click", "rich"} & tops) or name.startswith("cli")
 

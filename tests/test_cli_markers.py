@@ -65,7 +65,8 @@ def test_simulated_tool_is_as_asked(run):
 def result(run, tmp_path_factory):
     """What `estimate --model tight` prints and writes."""
     output = tmp_path_factory.mktemp("result")
-    done = call("estimate", run, "--model", "tight", "-o", output, "--json")
+    exports = ["--export", "tum", "--export", "npz", "--export", "hdf5"]
+    done = call("estimate", run, "--model", "tight", "-o", output, "--json", *exports)
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)["runs"][0]
 
@@ -95,6 +96,21 @@ def test_position_is_scored(run, result):
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 3.0
     assert judged["position_nees"] == pytest.approx(nees, rel=1e-6)
     assert 0.1 < nees < 10.0
+
+
+def test_exports_hold_pose_frames_and_setup(run, result):
+    """Would catch a trajectory without its position, frames of the wrong body, or a setup left out."""
+    folder = Path(result["result"])
+    read, again = (jaxekf.read_export(folder / f"estimate.{suffix}") for suffix in ("npz", "h5"))
+    assert read.keys() == again.keys()
+    path = np.loadtxt(folder / "trajectory.tum")
+    np.testing.assert_array_equal(path[:, 1:4], read["outputs/position/value"])
+    np.testing.assert_array_equal(path[:, [7, 4, 5, 6]], read["state/q_ref_body"])
+    assert read["outputs/position/value@frame"] == "reference"
+    assert read["outputs/object_attitude/value@frame"] == "object to reference"
+    assert read["covariance@frames"][:6] == ["reference"] * 3 + ["body"] * 3
+    places = read["parameters/setup/p_body_marker"]
+    np.testing.assert_array_equal(places, jaxekf.load(run).need_markers().p_body_marker)
 
 
 def test_blank_true_positions_do_not_count(run, result):

@@ -20,6 +20,7 @@ from jaxekf.cli.console import (
 from jaxekf.diagnostics import Diagnosis, diagnose
 from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
+from jaxekf.export import FILES
 from jaxekf.files import check_output
 from jaxekf.models import get_model
 from jaxekf.online import estimate_online
@@ -82,6 +83,14 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     is_flag=True,
     help="Each instant from the whole run, not only from what was measured until then.",
 )
+@click.option(
+    "--export",
+    "exports",
+    multiple=True,
+    type=click.Choice(tuple(FILES)),
+    help="A further file in each result folder: everything as estimate.npz or estimate.h5, the path as"
+    " trajectory.tum; repeatable.",
+)
 @overwrite_option
 @json_option
 def estimate(
@@ -91,6 +100,7 @@ def estimate(
     output: Path,
     online: bool,
     smooth: bool,
+    exports: tuple[str, ...],
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -111,7 +121,7 @@ def estimate(
         estimates = estimate_many(recordings, chosen, params, smooth=smooth)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
-        folder = made.save(output / recording.name, overwrite=overwrite)
+        folder = made.save(output / recording.name, overwrite=overwrite, exports=exports)
         diagnosis = diagnose(made, recording)
         summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
         warn(made, diagnosis)

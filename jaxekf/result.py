@@ -4,13 +4,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
 from jaxekf import manifold, parameters
-from jaxekf.files import whole_folder
+from jaxekf.files import finite_or_null, whole_folder
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import NANOSECONDS, Floats, Times
 from jaxekf.storage import SCHEMA_VERSION
@@ -32,6 +32,26 @@ class OutputEstimate:
     def sigma(self) -> Floats:
         """(N, d) standard deviations."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+
+
+class Estimated(Protocol):
+    """What an estimate says over time, made just now or read from a result folder."""
+
+    @property
+    def run(self) -> str: ...
+
+    @property
+    def time_ns(self) -> Times:
+        """(N,) instants."""
+        ...
+
+    @property
+    def time(self) -> Floats:
+        """(N,) seconds since the first instant."""
+        ...
+
+    @property
+    def outputs(self) -> dict[str, OutputEstimate]: ...
 
 
 @dataclass(frozen=True)
@@ -138,12 +158,19 @@ class Estimate:
             "notes": list(self.notes),
         }
 
-    def save(self, path: Path | str, *, overwrite: bool = False) -> Path:
+    def save(
+        self,
+        path: Path | str,
+        *,
+        overwrite: bool = False,
+        diagnosis: Mapping[str, Any] | None = None,
+    ) -> Path:
         """Write the result folder, whole or not at all.
 
         ``estimate.csv`` state, outputs and standard deviations; ``covariance.npz`` full matrices;
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
-        account and provenance.
+        account, provenance and, where it is given, the `diagnosis` (`Diagnosis.as_dict`, with its curves
+        for `jaxekf report`).
         """
         with whole_folder(path, "result.json", overwrite=overwrite) as folder:
             columns, values = self._table()
@@ -163,6 +190,8 @@ class Estimate:
                 },
                 "provenance": self.provenance,
             }
+            if diagnosis is not None:
+                document["diagnosis"] = finite_or_null(diagnosis)
             text = json.dumps(document, indent=2, allow_nan=False)
             (folder / "result.json").write_text(text + "\n", "utf-8")
         return Path(path)

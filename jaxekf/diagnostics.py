@@ -19,11 +19,10 @@ from jaxekf.consistency import (
     judge_whiteness,
     whiten,
 )
-from jaxekf.metrics import attitude_error, normalised_square
+from jaxekf.metrics import normalised_square, scored_errors
 from jaxekf.recording import Flags, Floats, Recording
 from jaxekf.result import Estimate
 from jaxekf.signatures import BIAS, LATENCY, MATRIX, Faults, attitude_rows, find_faults
-from jaxekf.truth import encoder_at, encoder_rate_at, encoder_velocity_at
 from jaxekf.verdicts import (
     Fault,
     Verdict,
@@ -40,6 +39,8 @@ _KINDS = {
     "gyroscope_bias": (BIAS, "rad/s"),
     "gyroscope_matrix": (MATRIX, "1"),
 }
+_CURVES = ("lag_s", "autocorrelation", "bound")
+_CURVE_DECIMALS = 5
 
 
 @dataclass(frozen=True)
@@ -77,14 +78,14 @@ class Diagnosis:
         ]
         return (f"nothing speaks against it: {'; '.join(told)}",) if told else ()
 
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON: everything but the autocorrelation at each lag."""
+    def as_dict(self, *, curves: bool = False) -> dict[str, Any]:
+        """For JSON. With `curves` also the autocorrelation (rows, L) at each lag and its bound, rounded."""
         return {
             "runs": list(self.runs),
-            "verdicts": [_plain(verdict) for verdict in self.verdicts],
+            "verdicts": [_plain(verdict, curves) for verdict in self.verdicts],
             "notes": list(self.notes),
-            "sensors": {name: _plain(sensor) for name, sensor in self.sensors.items()},
-            "parts": {name: _plain(part) for name, part in self.parts.items()},
+            "sensors": {name: _plain(sensor, curves) for name, sensor in self.sensors.items()},
+            "parts": {name: _plain(part, curves) for name, part in self.parts.items()},
         }
 
 
@@ -203,30 +204,22 @@ def _errors(
     for made, recording in zip(estimates, recordings, strict=False):
         if recording.encoder is None:
             continue
-        truth = encoder_at(recording.encoder, made.time_ns)
-        errors: dict[str, Floats] = {}
-        if "attitude" in made.outputs:
-            errors["attitude"] = attitude_error(made.attitude.value, truth.q_ref_body)
-        if "rate" in made.outputs:
-            errors["rate"] = made.rate.value - encoder_rate_at(recording.encoder, made.time_ns)
-        if "position" in made.outputs and truth.position is not None:
-            errors["position"] = made.outputs["position"].value - truth.position
-        if "velocity" in made.outputs and truth.position is not None:
-            velocity = encoder_velocity_at(recording.encoder, made.time_ns)
-            errors["velocity"] = made.outputs["velocity"].value - velocity
-        for name, error in errors.items():
-            kept: Flags = truth.scored & np.isfinite(error).all(axis=1)
+        for name, error in scored_errors(made, recording).items():
+            kept: Flags = np.isfinite(error).all(axis=1)
             squares = normalised_square(error[kept], made.outputs[name].cov[kept])
             found.setdefault(name, []).append(squares)
     return found
 
 
-def _plain(node: Any) -> Any:
-    """A dataclass as what JSON knows, without curves."""
+def _plain(node: Any, curves: bool) -> Any:
+    """A dataclass as what JSON knows; curves rounded, or left out."""
     if isinstance(node, Consistency | Whiteness | Fault | Verdict | SensorDiagnosis):
-        curves = ("lag_s", "autocorrelation", "bound")
-        named = {f.name: getattr(node, f.name) for f in fields(node) if f.name not in curves}
-        return {key: _plain(value) for key, value in named.items()}
+        named = {f.name: getattr(node, f.name) for f in fields(node)}
+        for name in (name for name in _CURVES if name in named):
+            curve = named.pop(name)
+            if curves:
+                named[name] = np.round(curve, _CURVE_DECIMALS)
+        return {key: _plain(value, curves) for key, value in named.items()}
     if isinstance(node, np.ndarray):
         return node.tolist()
-    return [_plain(item) for item in node] if isinstance(node, tuple) else node
+    return [_plain(item, curves) for item in node] if isinstance(node, tuple) else node

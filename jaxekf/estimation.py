@@ -271,7 +271,9 @@ def _collect(
         params=params._replace(setup=line.setup),
         notes=notes,
         smoothed=smooth,
-        provenance=provenance() | {"recording": str(recording.path or recording.name)},
+        # Absolute, so that it is found again from another working folder.
+        provenance=provenance()
+        | {"recording": str(recording.path.resolve() if recording.path else recording.name)},
     )
 
 

@@ -1,14 +1,18 @@
 """Output that is written whole or not at all."""
 
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from jaxekf.errors import RecordingError
+
+_HEAD = 1000
+"""Bytes of a file in which its marker must stand."""
 
 
 def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> None:
@@ -72,6 +76,39 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def check_file(path: Path | str, marker: str, *, overwrite: bool = False) -> None:
+    """Raise `RecordingError` where an output file may not be written.
+
+    With `overwrite` it may replace an older file of the same kind: one whose head holds `marker`.
+    """
+    target = Path(path)
+    if not target.exists():
+        return
+    if target.is_dir():
+        raise RecordingError(target, "a folder", "the name of a file", "another output")
+    with target.open("rb") as file:
+        same = marker.encode() in file.read(_HEAD)
+    if not same:
+        raise RecordingError(
+            target, f"a file that holds no {marker}", "a new one", "another output"
+        )
+    if not overwrite:
+        raise RecordingError(
+            target, "a file that exists", "a new one", "another output or the overwrite option"
+        )
+
+
+def finite_or_null(node: Any) -> Any:
+    """A JSON document in which numbers that are not finite, of which JSON knows none, are null."""
+    if isinstance(node, Mapping):
+        return {key: finite_or_null(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [finite_or_null(value) for value in node]
+    if isinstance(node, float) and not math.isfinite(node):
+        return None
+    return node
 
 
 def write_whole(path: Path | str, text: str) -> None:

@@ -13,8 +13,8 @@ from jaxekf.recording import (
     Times,
     to_scipy,
 )
-from jaxekf.result import Estimate
-from jaxekf.truth import encoder_at, encoder_rate_at
+from jaxekf.result import Estimated
+from jaxekf.truth import encoder_at, encoder_rate_at, encoder_velocity_at
 
 
 class Score(NamedTuple):
@@ -59,7 +59,27 @@ def mean_nees(error: Floats, cov: Floats) -> float:
     return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
 
 
-def score(estimate: Estimate, recording: Recording, burn_in_s: float = 0.0) -> Score:
+def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
+    """Errors (N, 3) of those outputs (attitude, rate, position, velocity) of which the encoder tells the
+    truth; NaN at instants whose nearest encoder sample is not scored or not known. SI; of an attitude the
+    rotation vector in the body frame. Raises `RecordingError` for a run without an encoder.
+    """
+    encoder, outputs = recording.need_encoder(), estimate.outputs
+    truth = encoder_at(encoder, estimate.time_ns)
+    errors: dict[str, Floats] = {}
+    if "attitude" in outputs:
+        errors["attitude"] = attitude_error(outputs["attitude"].value, truth.q_ref_body)
+    if "rate" in outputs:
+        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, estimate.time_ns)
+    if "position" in outputs and truth.position is not None:
+        errors["position"] = outputs["position"].value - truth.position
+    if "velocity" in outputs and truth.position is not None:
+        velocity = encoder_velocity_at(encoder, estimate.time_ns)
+        errors["velocity"] = outputs["velocity"].value - velocity
+    return {name: np.where(truth.scored[:, None], e, np.nan) for name, e in errors.items()}
+
+
+def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> Score:
     """Errors of attitude, rate and position, and NEES of attitude and position, at those instants of the
     estimate whose nearest encoder sample is scored.
 
@@ -70,17 +90,18 @@ def score(estimate: Estimate, recording: Recording, burn_in_s: float = 0.0) -> S
     judged = truth.scored & (estimate.time >= burn_in_s)
     attitude = rate = nees = float("nan")
     if "attitude" in estimate.outputs:
-        error = attitude_error(estimate.attitude.value[judged], truth.q_ref_body[judged])
+        output = estimate.outputs["attitude"]
+        error = attitude_error(output.value[judged], truth.q_ref_body[judged])
         attitude = float(np.rad2deg(rms(error)))
-        nees = mean_nees(error, estimate.attitude.cov[judged])
+        nees = mean_nees(error, output.cov[judged])
     if "rate" in estimate.outputs:
         true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
-        rate = float(np.rad2deg(rms(estimate.rate.value[judged] - true_rate)))
+        rate = float(np.rad2deg(rms(estimate.outputs["rate"].value[judged] - true_rate)))
     where, where_nees = _position_score(estimate, truth, judged)
     return Score(attitude, rate, nees, where, where_nees, int(judged.sum()))
 
 
-def _position_score(estimate: Estimate, truth: Encoder, judged: Flags) -> tuple[float, float]:
+def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple[float, float]:
     """RMSE in mm and NEES of the position; a blank cell of the encoder's position does not count."""
     if "position" not in estimate.outputs or truth.position is None:
         return float("nan"), float("nan")

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from jaxekf import export, manifold, parameters
 from jaxekf.errors import ModelError
 from jaxekf.export import Entry
-from jaxekf.files import whole_file, whole_folder
+from jaxekf.files import finite_or_null, whole_file, whole_folder
 from jaxekf.manifold import Manifold
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import NANOSECONDS, Floats, Times
@@ -35,6 +35,26 @@ class OutputEstimate:
     def sigma(self) -> Floats:
         """(N, d) standard deviations."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+
+
+class Estimated(Protocol):
+    """What an estimate says over time, made just now or read from a result folder."""
+
+    @property
+    def run(self) -> str: ...
+
+    @property
+    def time_ns(self) -> Times:
+        """(N,) instants."""
+        ...
+
+    @property
+    def time(self) -> Floats:
+        """(N,) seconds since the first instant."""
+        ...
+
+    @property
+    def outputs(self) -> dict[str, OutputEstimate]: ...
 
 
 @dataclass(frozen=True)
@@ -159,13 +179,19 @@ class Estimate:
         return Path(path)
 
     def save(
-        self, path: Path | str, *, overwrite: bool = False, exports: Iterable[str] = ()
+        self,
+        path: Path | str,
+        *,
+        overwrite: bool = False,
+        exports: Iterable[str] = (),
+        diagnosis: Mapping[str, Any] | None = None,
     ) -> Path:
         """Write the result folder, whole or not at all.
 
         ``estimate.csv`` state, outputs and standard deviations; ``covariance.npz`` full matrices;
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
-        account and provenance. `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
+        account, provenance and, where it is given, the `diagnosis` (`Diagnosis.as_dict`, with its curves
+        for `jaxekf report`). `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
         `estimate.h5`, ``tum`` `trajectory.tum`.
         """
         added = export.files_of(path, exports)
@@ -188,6 +214,8 @@ class Estimate:
                 },
                 "provenance": self.provenance,
             }
+            if diagnosis is not None:
+                document["diagnosis"] = finite_or_null(diagnosis)
             text = json.dumps(document, indent=2, allow_nan=False)
             (folder / "result.json").write_text(text + "\n", "utf-8")
         return Path(path)

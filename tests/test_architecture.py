@@ -49,8 +49,13 @@ ORDER = [
         "plots.single_markers",
     ),
     ("plots",),
+    ("report.saved", "report.thinning"),
+    ("report.evidence", "report.grid"),
+    ("report.figures", "report.summary"),
+    ("report.consistency", "report.page"),
+    ("report",),
     ("cli.console", "cli.machine", "cli.options"),
-    ("cli.simulate", "cli.estimate"),
+    ("cli.simulate", "cli.estimate", "cli.report"),
     ("cli.plot", "cli.tune"),
     ("cli.demo",),
     ("cli",),
@@ -97,10 +102,11 @@ def test_imports_run_one_way(file):
 
 @pytest.mark.parametrize("file", FILES, ids=module_name)
 def test_who_may_know_what(file):
-    """Would catch matplotlib outside plots, optax outside tuning, HDF5 outside exports, and tuning outside
-    the command line."""
+    """Would catch matplotlib outside plots, plotly outside report, HDF5 outside exports, optax outside
+    tuning, and tuning outside the command line."""
     name, tops = module_name(file), {m.split(".")[0] for m in imports(file)}
     assert "matplotlib" not in tops or name.split(".")[0] == "plots"
+    assert "plotly" not in tops or name.split(".")[0] == "report"
     assert "optax" not in tops
     assert "h5py" not in tops or name == "export"
     assert "tuning" not in tops or name.startswith("cli")

@@ -1,4 +1,4 @@
-"""The command line: simulate, estimate, tune, plot, demo."""
+"""The command line: simulate, estimate, tune, plot, report, demo."""
 
 import click
 import jax
@@ -9,6 +9,7 @@ from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
 from jaxekf.cli.machine import prepare
 from jaxekf.cli.plot import plot
+from jaxekf.cli.report import report
 from jaxekf.cli.simulate import simulate
 from jaxekf.cli.tune import tune
 
@@ -24,5 +25,5 @@ def main() -> None:
     prepare()
 
 
-for command in (simulate, estimate, tune, plot, demo):
+for command in (simulate, estimate, tune, plot, report, demo):
     main.add_command(command)

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxekf.errors import JaxekfError
+from jaxekf.files import finite_or_null
 from jaxekf.models import REGISTRY
 
 json_option = click.option(
@@ -58,17 +59,7 @@ def note(text: str) -> None:
 
 def print_json(document: Any) -> None:
     """One JSON document on standard output; numbers that are not finite become null."""
-    click.echo(json.dumps(_finite(document), indent=2))
-
-
-def _finite(node: Any) -> Any:
-    if isinstance(node, dict):
-        return {key: _finite(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [_finite(value) for value in node]
-    if isinstance(node, float) and (node != node or node in (float("inf"), float("-inf"))):
-        return None
-    return node
+    click.echo(json.dumps(finite_or_null(document), indent=2))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -12,6 +12,7 @@ from jaxekf.cli.console import json_option, note, print_json, tuning_progress
 from jaxekf.cli.plot import draw
 from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo as runs
+from jaxekf.diagnostics import diagnose
 from jaxekf.files import check_output, whole_folder
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
@@ -60,7 +61,8 @@ def demo(output: Path, as_json: bool) -> None:
     with whole_folder(output, "demo.json", overwrite=True) as folder:
         tuned.save(folder)
         for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
-            made.save(folder / "result" / recording.name)
+            found = diagnose(made, recording).as_dict(curves=True)
+            made.save(folder / "result" / recording.name, diagnosis=found)
             chosen = ("attitude", "occlusion")
             if recording.name == "constant-rate":
                 chosen = possible_figures(made, recording)

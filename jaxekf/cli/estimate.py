@@ -121,8 +121,13 @@ def estimate(
         estimates = estimate_many(recordings, chosen, params, smooth=smooth)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
-        folder = made.save(output / recording.name, overwrite=overwrite, exports=exports)
         diagnosis = diagnose(made, recording)
+        folder = made.save(
+            output / recording.name,
+            overwrite=overwrite,
+            exports=exports,
+            diagnosis=diagnosis.as_dict(curves=True),
+        )
         summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
         warn(made, diagnosis)
         note(f"wrote {folder}")

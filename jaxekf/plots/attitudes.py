@@ -52,7 +52,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
     sight, known = look(estimate, recording), truth(estimate, recording)
     t, estimated = estimate.time, euler_deg(estimate.attitude.value)
     sigma = euler_sigma_deg(estimate.attitude.value, estimate.attitude.cov)
-    measured = _same_turn(sight.pose.q_ref_body[sight.seen], sight.t, t, estimated)
+    measured = same_turn(sight.pose.q_ref_body[sight.seen], sight.t, t, estimated)
     with styled():
         figure, grid = new_grid(3, 1 if known is None else 2, (11, 6.5), sharex=True)
         for i, name in enumerate(_ANGLES):
@@ -60,7 +60,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
             shade(axes, sight)
             axes.plot(sight.t, measured[:, i], ".", ms=2.5, color=MEASURED, label=sight.label)
             if known is not None:
-                angles = _same_turn(known.q_ref_body, t, t, estimated)
+                angles = same_turn(known.q_ref_body, t, t, estimated)
                 angles[~known.valid] = np.nan
                 axes.plot(t, angles[:, i], color=TRUTH, lw=2.2, label="encoder")
             band(axes, t, estimated[:, i], sigma[:, i], "2σ of the estimate")
@@ -72,7 +72,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
     return figure
 
 
-def _same_turn(q: Floats, t: Floats, t_near: Floats, near: Floats) -> Floats:
+def same_turn(q: Floats, t: Floats, t_near: Floats, near: Floats) -> Floats:
     """Euler angles (N, 3) in degrees at `t`, on the same turn as the curve `near` (M, 3) at `t_near`.
 
     Unwrapping by itself may take another turn wherever samples are missing.
@@ -119,13 +119,13 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
         t, estimated = estimate.time[near], estimate.attitude.value[near]
         angles = euler_deg(estimated)
         sigma = euler_sigma_deg(estimated, estimate.attitude.cov[near])
-        held_angles = _same_turn(held, t_held, t, angles)
+        held_angles = same_turn(held, t_held, t, angles)
         for i, name in enumerate(_ANGLES):
             axes = grid[i, 0]
             shade(axes, sight)
             _hold(axes, t_held, held_angles[:, i])
             if known is not None:
-                true_angles = _same_turn(known.q_ref_body[near], t, t, angles)
+                true_angles = same_turn(known.q_ref_body[near], t, t, angles)
                 true_angles[~known.valid[near]] = np.nan
                 axes.plot(t, true_angles[:, i], color=TRUTH, lw=2.2, label="encoder")
             band(axes, t, angles[:, i], sigma[:, i], "2σ of the estimate")

@@ -18,11 +18,11 @@ from jaxekf.plots.style import (
     styled,
 )
 from jaxekf.recording import Floats, Recording
-from jaxekf.result import Estimate
+from jaxekf.result import Estimate, Estimated
 from jaxekf.truth import encoder_rate_at
 
 
-class _Told(NamedTuple):
+class Told(NamedTuple):
     """What the encoder says the gyroscope's bias was, deg/s."""
 
     t: Floats
@@ -35,7 +35,7 @@ class _Told(NamedTuple):
 def bias(estimate: Estimate, recording: Recording) -> Figure:
     """Gyroscope bias with its 2 sigma band, and what the encoder says it was; on the right that of the
     accelerometer, of which an encoder tells nothing."""
-    sight, told = look(estimate, recording), _told(estimate, recording)
+    sight, known = look(estimate, recording), told(estimate, recording)
     has_force = "accelerometer_bias" in {p.name for p in manifold.parts(estimate.model.space)}
     with styled():
         size = (11, 6.5) if has_force else (9, 6.5)
@@ -44,8 +44,8 @@ def bias(estimate: Estimate, recording: Recording) -> Figure:
         for i, axis in enumerate(AXES):
             axes = grid[i, 0]
             shade(axes, sight)
-            if told is not None:
-                _draw_told(axes, told, i)
+            if known is not None:
+                _draw_told(axes, known, i)
             value, sigma = np.rad2deg(turning.value[:, i]), np.rad2deg(turning.sigma[:, i])
             _draw(axes, estimate.time, value, sigma)
             axes.set_ylabel(f"gyroscope about {axis} (deg/s)")
@@ -59,7 +59,8 @@ def bias(estimate: Estimate, recording: Recording) -> Figure:
     return figure
 
 
-def _told(estimate: Estimate, recording: Recording) -> _Told | None:
+def told(estimate: Estimated, recording: Recording) -> Told | None:
+    """What the encoder says; None without one."""
     if recording.encoder is None:
         return None
     imu = recording.need_imu()
@@ -67,11 +68,11 @@ def _told(estimate: Estimate, recording: Recording) -> _Told | None:
     t = seconds(imu.time_ns[inside], estimate)
     true_rate = encoder_rate_at(recording.encoder, imu.time_ns[inside])
     difference = np.rad2deg(imu.gyroscope[inside] - true_rate)
-    return _Told(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))
+    return Told(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))
 
 
-def _draw_told(axes: Any, told: _Told, i: int) -> None:
-    mean = _running_mean(told.t, told.difference[:, i], 2.0)
+def _draw_told(axes: Any, told: Told, i: int) -> None:
+    mean = running_mean(told.t, told.difference[:, i], 2.0)
     axes.plot(*mean, color=MEASURED, lw=1, label="gyroscope − encoder, 2 s mean")
     if told.at_rest is not None:
         axes.axhline(told.at_rest[i], color=TRUTH, lw=1.2, ls="--", label="measured at rest")
@@ -87,7 +88,7 @@ def _draw(axes: Any, t: Floats, value: Floats, sigma: Floats) -> None:
     axes.set_ylim(middle - reach, middle + reach)
 
 
-def _running_mean(t: Floats, values: Floats, seconds: float) -> tuple[Floats, Floats]:
+def running_mean(t: Floats, values: Floats, seconds: float) -> tuple[Floats, Floats]:
     """Mean over a window, without the half windows at the ends and without unknown samples."""
     known = np.isfinite(values)
     t, values = t[known], values[known]

@@ -21,7 +21,7 @@ from jaxekf.recording import (
     period_ns,
     to_scipy,
 )
-from jaxekf.result import Estimate
+from jaxekf.result import Estimated
 from jaxekf.truth import encoder_at
 
 Stretch = tuple[float, float]
@@ -43,19 +43,19 @@ class Sight(NamedTuple):
     """Of what is without any marker."""
 
 
-def seconds(time_ns: Times, estimate: Estimate) -> Floats:
+def seconds(time_ns: Times, estimate: Estimated) -> Floats:
     """Seconds since the estimate's first instant."""
     return (time_ns - estimate.time_ns[0]) / NANOSECONDS
 
 
-def truth(estimate: Estimate, recording: Recording) -> Encoder | None:
+def truth(estimate: Estimated, recording: Recording) -> Encoder | None:
     """The encoder at the estimate's instants."""
     if recording.encoder is None:
         return None
     return encoder_at(recording.encoder, estimate.time_ns)
 
 
-def look(estimate: Estimate, recording: Recording) -> Sight:
+def look(estimate: Estimated, recording: Recording) -> Sight:
     """What the tracker saw: its poses, or those of the markers where there are only those."""
     optical, markers = recording.optical, recording.markers
     raw, label = optical, "tracker"
@@ -79,7 +79,7 @@ def at_origin(raw: Optical) -> Optical:
     return replace(raw, time_ns=taken, position=position, p_body_tool=None, latency_ns=0)
 
 
-def _gaps(time_ns: Times, seen: Flags, estimate: Estimate) -> list[Stretch]:
+def _gaps(time_ns: Times, seen: Flags, estimate: Estimated) -> list[Stretch]:
     """Stretches of the estimate with nothing seen for more than two periods, its end included."""
     longest = 2.5 * period_ns(time_ns) / NANOSECONDS
     end = float(estimate.time[-1])
@@ -99,7 +99,7 @@ def shade(axes: Any, sight: Sight) -> None:
             axes.axvspan(begin, end, color=colour, lw=0, zorder=0, label=label if i == 0 else None)
 
 
-def longest_gap(recording: Recording, estimate: Estimate) -> Stretch:
+def longest_gap(recording: Recording, estimate: Estimated) -> Stretch:
     """Start and end, in seconds since the start of the estimate, of the longest time without a pose."""
     t, end = look(estimate, recording).t, float(estimate.time[-1])
     t = np.append(t[t < end], end)

@@ -1,0 +1,40 @@
+"""`jaxekf report`: one HTML page of results."""
+
+from pathlib import Path
+
+import click
+
+from jaxekf.cli.console import json_option, note, overwrite_option, print_json
+from jaxekf.report import write_report
+
+
+@click.command()
+@click.argument("results", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("report.html"),
+    show_default=True,
+)
+@overwrite_option
+@json_option
+def report(results: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
+    """Show RESULTS, folders written by jaxekf estimate, in one HTML file that needs no network.
+
+    Estimates with their bands beside tracker, gyroscope and encoder, biases, innovations, what became of
+    every sample, and the verdicts. Recordings are looked for where they were when they were estimated.
+    """
+    made = write_report(results, output, overwrite=overwrite)
+    for name, missing in zip(made.runs, made.missing, strict=True):
+        if missing:
+            note(f"{name}: measurements and truth are not shown: {missing}")
+    note(f"wrote {made.path} ({made.size / 1e6:.1f} MB)")
+    if as_json:
+        runs = [
+            {"name": name, "result": str(folder), "recording_missing": missing, **row._asdict()}
+            for name, folder, row, missing in zip(
+                made.runs, results, made.summaries, made.missing, strict=True
+            )
+        ]
+        print_json({"report": str(made.path), "bytes": made.size, "runs": runs})

@@ -205,7 +205,7 @@ def _errors(
         if recording.encoder is None:
             continue
         for name, error in scored_errors(made, recording).items():
-            kept: Flags = np.isfinite(error).all(axis=1)
+            kept: Flags = np.asarray(np.isfinite(error).all(axis=1))
             squares = normalised_square(error[kept], made.outputs[name].cov[kept])
             found.setdefault(name, []).append(squares)
     return found

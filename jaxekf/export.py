@@ -110,7 +110,7 @@ def write_tum(
         position = np.zeros((len(time_ns), 3))
         notes.append("no position was estimated: tx ty tz are zero")
     poses = np.column_stack([position, q_ref_body[:, [1, 2, 3, 0]]])
-    known = np.isfinite(poses).all(axis=1)
+    known = np.asarray(np.isfinite(poses).all(axis=1))
     if not known.all():
         notes.append(
             f"left out: {np.sum(~known)} of {len(known)} instants, whose pose is not finite"

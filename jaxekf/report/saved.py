@@ -240,7 +240,7 @@ def _read_sensor(file: Path) -> SavedSensor:
         read_times(table),
         numbers(table, ("nis",), blank=True)[:, 0],
         (taken | kept_out).sum(axis=1).astype(float),
-        kept_out.any(axis=1) & ~taken.any(axis=1),
+        np.asarray(kept_out.any(axis=1) & ~taken.any(axis=1)),
     )
 
 

@@ -139,7 +139,7 @@ def tracked_pose(made: jaxekf.Estimate, optical: Optical, at: Any) -> tuple[Floa
     """What the motion capture should have said at these instants: its point, and its own frame."""
     turn = to_scipy(made.attitude.value[at])
     point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
-    frame = Rotation.from_rotvec(np.asarray(made.params.calibration.alignment))
+    frame = Rotation.from_rotvec(np.array(made.params.calibration.alignment))
     return made.outputs["position"].value[at] + turn.apply(point), turn * frame
 
 

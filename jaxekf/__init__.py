@@ -30,6 +30,7 @@ from jaxekf.parameters import load as load_parameters
 from jaxekf.parameters import save as save_parameters
 from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, Samples
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.robust import robust
 from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
 from jaxekf.storage import load, save
 from jaxekf.stream import Known, Stream
@@ -90,6 +91,7 @@ __all__ = [
     "load_parameters",
     "manifold",
     "read_export",
+    "robust",
     "rotation",
     "run_filter",
     "run_filter_batch",

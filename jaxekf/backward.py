@@ -146,7 +146,8 @@ def _before_update(
         return info
     prior = instant.filtered.prior
     ahead = Track(prior, instant.refused)
-    linear, cov, _ = look(system, prepared, ahead, instant.moment.u, samples, adjoint=adjoint)
+    judged, cov = look(system, prepared, ahead, instant.moment.u, samples, adjoint=adjoint)
+    linear = judged.linear
     gained = Gained(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
     taken = []
     for slope, rows in blocks_of_rows(system.measurements, linear):

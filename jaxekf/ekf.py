@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf import blocks, linalg, recursion, system
+from jaxekf import about, blocks, linalg, outliers, recursion, system
 from jaxekf.errors import ModelError
 from jaxekf.interpolation import InputSample, sample
 from jaxekf.linearise import linearise_sensor
 from jaxekf.model import Belief, Model, Parameters, Sensor
 from jaxekf.recursion import First, Given, Kept, What
+from jaxekf.relinearise import again, with_again
 from jaxekf.reverse_only import reverse_only
 from jaxekf.step import Moment
 from jaxekf.timeline import Rows, Steps
@@ -44,7 +45,10 @@ class Innovation(NamedTuple):
     gated: Array
     """(..., rows) visible rows that the chi-square gate kept out."""
     nis: Array
-    """(...) normalised innovation squared of the visible rows, gated ones included."""
+    """(...) normalised innovation squared of the visible rows, gated ones included, none weighted."""
+    weight: Array | None
+    """(..., rows) what the noise of a row was divided by: 1 where it counted in full, 0 where it was not
+    used; None for a sensor without weighting."""
 
 
 class Updated(NamedTuple):
@@ -97,6 +101,7 @@ def run_filter(
     adjoint: bool = True,
     checkpoint: bool = True,
     refused: Array | None = None,
+    relinearise: int = 0,
 ) -> FilterOutput:
     """Filter one run from an initial belief; differentiable in everything, and fast under `vmap`.
 
@@ -106,11 +111,15 @@ def run_filter(
     forward mode (forward over reverse is fine). With ``adjoint=False`` all derivatives are JAX's own.
     For the reverse pass a few beliefs are kept and the others computed again, unless `checkpoint` is
     False, which keeps all. `refused` is `Instant.refused` of where an earlier part of the run ended.
+    `relinearise` further linearisations of every update go about where it arrived, with the prediction's
+    covariance as the prior throughout (iterated extended Kalman filter, `jaxekf.relinearise`); gates,
+    weights, innovations and likelihood are those of the first.
 
     Raises `ModelError` for an unknown `keep`, and where forward mode meets the adjoint.
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
     options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "refused": one[3]}
+    options |= {"relinearise": relinearise}
     return jax.tree.map(lambda a: a[0], run_filter_batch(model, *one[:3], **options))
 
 
@@ -124,6 +133,7 @@ def run_filter_batch(
     adjoint: bool = True,
     checkpoint: bool = True,
     refused: Array | None = None,
+    relinearise: int = 0,
     devices: Sequence[Any] = (),
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
@@ -139,7 +149,7 @@ def run_filter_batch(
             f"got keep='{keep}', expected one of {sorted(_KEPT)}; choose what is to be kept"
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
-    ready, prepared, given = made_ready(model, params, belief, steps)
+    ready, prepared, given = made_ready(model, params, belief, steps, relinearise)
     inputs = given.moments.u
     what = _KEPT[keep]
     if adjoint:
@@ -163,13 +173,17 @@ def run_filter_batch(
 
 
 def made_ready(
-    model: Model, params: Parameters, belief: Belief, steps: Steps
+    model: Model, params: Parameters, belief: Belief, steps: Steps, relinearise: int = 0
 ) -> tuple[system.System, Any, Given]:
     """The model on lanes, what its steps need of the parameters, and what they are driven with; all
     arguments and the last two results carry the runs on the first axis.
 
-    Raises `ModelError` where there is no run or no step.
+    Raises `ModelError` where there is no run or no step, or for a negative number of linearisations.
     """
+    if relinearise < 0:
+        raise ModelError(
+            f"got relinearise={relinearise}, expected 0 or more; 0 linearises every update once"
+        )
     if 0 in steps.dt.shape:
         raise ModelError(
             f"got steps of shape {steps.dt.shape} (runs, epochs, substeps), expected at least one of"
@@ -178,7 +192,11 @@ def made_ready(
     inputs = jax.vmap(partial(inputs_of, model))(params, steps)
     sizes: Any = one_sample((params, belief.mean), 1)
     u, fast = one_sample((inputs, steps.fast), 3)
-    ready = system.build(model, sizes[0], sizes[1], u, fast | one_sample(steps.slow, 2))
+    spec = (model, sizes[0], sizes[1], u, fast | one_sample(steps.slow, 2))
+    ready = system.build(*spec)
+    if relinearise:
+        more = again(about.build(*spec), relinearise)
+        ready = with_again(ready, more)
     prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
     return ready, prepared, Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
 
@@ -233,4 +251,7 @@ def _innovation(
     noise = linalg.mask_covariance(noise, rows.mask)
     cov = linalg.symmetrise(spread + noise)
     nis = linalg.squared_distance(residual, cov)
-    return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, nis)
+    weight = outliers.weights(sensor, residual, cov, rows.mask)
+    if weight is not None:
+        weight = jnp.where(used, weight, 0.0)
+    return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, nis, weight)

@@ -235,6 +235,11 @@ def _collect(
         rows = (line.steps.fast if fast else line.steps.slow)[name]
         record = _sensor_record(output.innovations[name], rows, line, fast)
         sensors[name] = record
+        if record.weight is not None and (little := _counts_little(record)):
+            refused += (
+                f"{little} of {len(record.time_ns)} samples of {name} count less than half, so far are they"
+                " off",
+            )
         if name in account:
             rejected = int((record.gated.any(axis=1) & ~record.used.any(axis=1)).sum())
             account[name]["gated"] = rejected
@@ -294,7 +299,14 @@ def _sensor_record(innovation: Any, rows: Any, line: Timeline, fast: bool) -> Se
     )
     times = line.time_ns if fast else line.time_ns[:, -1]
     seen = np.asarray(rows.mask).any(axis=-1)
-    return SensorRecord(times[seen], *(part[seen] for part in parts))
+    kept: Any = [None if part is None else part[seen] for part in parts]
+    return SensorRecord(times[seen], *kept)
+
+
+def _counts_little(record: SensorRecord) -> int:
+    """Used samples of which some row counts less than half."""
+    assert record.weight is not None
+    return int(((record.weight < 0.5) & record.used).any(axis=1).sum())
 
 
 def provenance() -> dict[str, Any]:

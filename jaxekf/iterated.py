@@ -32,9 +32,11 @@ from jaxekf import (
 from jaxekf.about import AboutSystem
 from jaxekf.algebra import Gained
 from jaxekf.backward import Information
+from jaxekf.errors import ModelError
 from jaxekf.kernels import loop
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.recursion import Given
+from jaxekf.relinearise import turned
 from jaxekf.reverse_only import reverse_only
 from jaxekf.smoother import SmootherOutput
 from jaxekf.step import Moment
@@ -104,7 +106,16 @@ def run_iterated_smoother_batch(
     adjoint: bool = True,
     devices: Sequence[Any] = (),
 ) -> IteratedOutput:
-    """Many runs: every leaf of every argument carries the runs on its first axis, `moved` too."""
+    """Many runs: every leaf of every argument carries the runs on its first axis, `moved` too.
+
+    Raises `ModelError` for a model with heavy-tailed sensors (`jaxekf.robust`), and as
+    `run_smoother_batch`.
+    """
+    if any(sensor.weighting is not None for sensor in model.sensors):
+        raise ModelError(
+            f"model '{model.name}': got a sensor with heavy tails, expected gates or none, for least"
+            " squares know no tails; take run_smoother, or jaxekf.robust(model, 'gate')"
+        )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     first = smoother.run_smoother_batch(
         model, params, belief, steps, adjoint=adjoint, devices=devices
@@ -170,9 +181,9 @@ def _iteration(
     system: AboutSystem, adjoint: bool, prepared: Any, belief: Belief, given: Given, path: Path
 ) -> tuple[Path, Belief, Belief, Array]:
     """One step of Gauss and Newton: the path after it, the beliefs about it, and the longest move."""
-    away, turned = system.start(prepared["start"], belief.mean, path.start, adjoint=adjoint)
-    delta = -loop(algebra.apply, turned, away)
-    cov = _turned(turned, belief.cov)
+    away, changed = system.start(prepared["start"], belief.mean, path.start, adjoint=adjoint)
+    delta = -loop(algebra.apply, changed, away)
+    cov = turned(changed, belief.cov)
     before = jax.tree.map(backward.one_earlier, path.start, path.mean)
     places = _Place(given.moments, before, path.mean, path.noise)
     ahead = partial(_epoch_ahead, system, adjoint, prepared)
@@ -184,12 +195,6 @@ def _iteration(
     start, first = _moved(system, prepared, path.start, delta, cov, info, adjoint)
     farthest = jnp.maximum(jnp.max(longest, axis=(0, 1)), first)
     return Path(start.mean, found.mean, noise), found, start, farthest
-
-
-def _turned(matrix: Array, cov: Array) -> Array:
-    """``M P M'``."""
-    half = loop(algebra.product, matrix, cov)
-    return loop(lambda h, m: linalg.symmetrise(algebra.product_transposed(h, m)), half, matrix)
 
 
 def _linear(
@@ -301,5 +306,5 @@ def _moved(
     delta = delta + loop(algebra.apply, cov, info.vector)
     cov = backward.lessened(cov, info.matrix)
     longest = lax.stop_gradient(jnp.max(jnp.abs(delta) / jnp.sqrt(linalg.diagonal(cov)), axis=0))
-    moved, turned = system.move(prepared["move"], mean, delta, adjoint=adjoint)
-    return Belief(moved, _turned(turned, cov)), longest
+    moved, reset = system.move(prepared["move"], mean, delta, adjoint=adjoint)
+    return Belief(moved, turned(reset, cov)), longest

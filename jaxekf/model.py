@@ -7,7 +7,7 @@ it over time and maps it over runs. Nothing here knows a particular model.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from jax import Array
 
@@ -77,6 +77,9 @@ class Sensor:
     """Group of each row; a gate accepts or rejects a group whole. None puts all rows in one group."""
     gate: float | None = None
     """Probability with which a good group passes the chi-square gate; None for no gate."""
+    weighting: Literal["huber", "student"] | None = None
+    """Law of heavy tails by which a group counts less the farther it is off; None for none. The
+    likelihood is then that of the noise so enlarged."""
     aux_like: Any = None
     """Auxiliary data of an ordinary sample, where it needs any: for samples that come without."""
 

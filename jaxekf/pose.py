@@ -22,7 +22,7 @@ from jaxekf.truth import encoder_at
 
 START_FIT = 4.0
 """A run does not start from a frame whose markers fit the tool this much worse than the median."""
-_LARGEST_MISFIT = 0.1
+_LARGEST_MISFIT = 0.25
 """Markers that lie off the tool by more than this share of its size are not those of the tool."""
 _START_S = 1.0
 _START_TURN = 6.0

@@ -72,6 +72,9 @@ class SensorRecord:
     """(N, rows) visible rows that the gate kept out."""
     nis: Floats
     """(N,) normalised innovation squared, chi-square with as many degrees as visible rows."""
+    weight: Floats | None = None
+    """(N, rows) what the noise was divided by where tails are heavy: 1 in full, 0 where not used; None for
+    a sensor without weighting."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,10 @@ class Estimate:
             "mean_nis": {
                 name: self.mean_nis(name) if len(record.nis) else None
                 for name, record in self.sensors.items()
+            },
+            "outliers": {
+                sensor.name: {"gate": sensor.gate, "weighting": sensor.weighting}
+                for sensor in self.model.sensors
             },
             "account": self.account,
             "notes": list(self.notes),
@@ -283,6 +290,8 @@ class Estimate:
         said = {"time_ns": {"unit": "ns"}, "residual": about, "cov": about, "nis": {"unit": "1"}}
         columns = {"time_ns": "time_ns", "residual": "residual", "cov": "covariance"}
         columns |= {key: key for key in ("used", "gated", "nis")}
+        if record.weight is not None:
+            columns["weight"] = "weight"
         return {
             f"sensors/{name}/{path}": Entry(np.asarray(getattr(record, key)), said.get(key, {}))
             for key, path in columns.items()
@@ -373,6 +382,9 @@ def _innovation_table(
     sigma = np.sqrt(record.cov[:, rows, rows])
     hidden = np.where(record.used, 0.0, np.nan)
     heads = ["residual", "sigma", "used", "gated"]
-    columns = [f"{head}_{label}" if label else head for head in heads for label in labels]
     values = [record.residual + hidden, sigma + hidden, record.used, record.gated, record.nis]
+    if record.weight is not None:
+        heads.append("weight")
+        values.insert(4, record.weight)
+    columns = [f"{head}_{label}" if label else head for head in heads for label in labels]
     return [*columns, "nis"], record.time_ns, np.column_stack(values).astype(float)

@@ -5,14 +5,12 @@ from functools import reduce
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
-from jax import Array, lax
-from scipy.stats import chi2
+from jax import Array
 
-from jaxekf import algebra, linalg, patterned
+from jaxekf import algebra, linalg, outliers, patterned
 from jaxekf.algebra import Gained
-from jaxekf.lanes import written_sum
-from jaxekf.model import Belief, Sensor
+from jaxekf.model import Belief
+from jaxekf.outliers import Judged, Linear
 from jaxekf.patterned import Pattern
 from jaxekf.system import Measurement, System
 from jaxekf.timeline import Rows
@@ -59,23 +57,6 @@ def begin(system: System, belief: Belief, refused: Array | None) -> Track:
     return Track(belief, refused)
 
 
-class Linear(NamedTuple):
-    """One sensor linearised: rows, and the pattern of their slope."""
-
-    slope: Pattern
-    rows: algebra.Rows
-
-
-class Gates(NamedTuple):
-    """What the gates of all sensors make of the samples of one instant."""
-
-    gated: dict[str, Array]
-    refused: Array | None
-    recovered: Array | None
-    widened: Array | None
-    """(lanes,) what the predicted covariance is multiplied by."""
-
-
 def predict(
     system: System, prepared: Any, belief: Belief, moment: Moment, *, adjoint: bool
 ) -> Belief:
@@ -109,24 +90,32 @@ def update(
 ) -> Outcome:
     """Take every sensor sampled at the end of a substep; `adjoint` as in `predict`."""
     prior = ahead.belief
-    linear, cov, gates = look(system, prepared, ahead, u, samples, adjoint=adjoint)
+    judged, cov = look(system, prepared, ahead, u, samples, adjoint=adjoint)
+    linear = judged.linear
     used = {name: one.rows.mask for name, one in linear.items()}
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
         nothing, sound = jnp.zeros(lanes, dtype), _is_sound(prior.cov)
         never = None if ahead.refused is None else jnp.zeros(lanes, bool)
-        return Outcome(prior, ahead, nothing, sound, used, gates.gated, never)
+        return Outcome(prior, ahead, nothing, sound, used, judged.gated, never)
     gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
     for slope, rows in blocks_of_rows(system.measurements, linear):
-        gained, pivot = _take(slope, gained, rows, adjoint)
+        gained, pivot = take_block(slope, gained, rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
     posterior = _correct(
         system, prepared["correction"], prior, gained, list(used.values()), adjoint
     )
+    if system.again is not None:
+        widened = Belief(prior.mean, cov)
+        posterior, pivot = system.again(
+            prepared["again"], widened, posterior, u, samples, linear, adjoint=adjoint
+        )
+        smallest = jnp.minimum(smallest, pivot)
     healthy = (smallest > 0.0) & _is_sound(posterior.cov)
-    after = Track(posterior, gates.refused)
-    return Outcome(prior, after, gained.log_likelihood, healthy, used, gates.gated, gates.recovered)
+    after = Track(posterior, judged.refused)
+    told = (used, judged.gated, judged.recovered)
+    return Outcome(prior, after, gained.log_likelihood, healthy, *told)
 
 
 def look(
@@ -137,9 +126,9 @@ def look(
     samples: dict[str, Rows],
     *,
     adjoint: bool,
-) -> tuple[dict[str, Linear], Array, Gates]:
-    """Every sensor linearised at the prediction, with what its gate refuses hidden; the predicted
-    covariance, widened where the gates were opened; and what the gates did."""
+) -> tuple[Judged, Array]:
+    """Every sensor linearised at the prediction and judged by gates and weights; and the predicted
+    covariance, widened where the gates were opened."""
     prior = ahead.belief
     seen: dict[str, Linear] = {}
     for name, sample in samples.items():
@@ -148,10 +137,9 @@ def look(
         found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
         residual, slope, noise = found
         seen[name] = hide(measurement, residual, slope, noise, sample.mask)
-    gates = _gates(system, seen, samples, ahead)
-    linear = {name: _without(one, gates.gated[name]) for name, one in seen.items()}
-    cov = prior.cov if gates.widened is None else prior.cov * gates.widened[None, None]
-    return linear, cov, gates
+    judged = outliers.judge(system, seen, samples, prior.cov, ahead.refused)
+    cov = prior.cov if judged.widened is None else prior.cov * judged.widened[None, None]
+    return judged, cov
 
 
 def _is_sound(cov: Array) -> Array:
@@ -181,77 +169,10 @@ def hide(
     return Linear(measurement.slope, algebra.Rows(residual, slope, noise, mask))
 
 
-def _without(linear: Linear, gated: Array) -> Linear:
-    return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
-
-
-def _gates(
-    system: System, seen: dict[str, Linear], samples: dict[str, Rows], ahead: Track
-) -> Gates:
-    """Rows that are kept out, and the way back for a belief that keeps everything out.
-
-    Where gates have let nothing in while they refused samples for longer than the model's patience, it
-    is the belief that is wrong: the gates open once, and the covariance is multiplied by how many
-    times larger than expected the squared errors are.
-    """
-    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in seen.items()}
-    watched = [n for n in seen if system.measurements[n].sensor.gate is not None]
-    prior = ahead.belief.cov
-    none = jnp.zeros(prior.shape[-1], bool)
-    if ahead.refused is None:
-        return Gates(gated, None, None, None)
-    if not watched:
-        return Gates(gated, ahead.refused, none, None)
-    let_in, kept_out, finite = none, none, {}
-    refused_s, excess = jnp.zeros_like(ahead.refused), jnp.ones_like(ahead.refused)
-    for name in watched:
-        rows = seen[name].rows
-        gated[name], ratio = _gate(system.measurements[name].sensor, seen[name], prior)
-        finite[name] = gated[name] & (jnp.stack(ratio) < jnp.inf)
-        for row in range(rows.mask.shape[0]):
-            let_in = let_in | (rows.mask[row] & ~gated[name][row])
-            kept_out = kept_out | finite[name][row]
-            larger = jnp.maximum(excess, ratio[row])
-            excess = jnp.where(finite[name][row], larger, excess)
-            late = jnp.maximum(refused_s, samples[name].dt)
-            refused_s = jnp.where(finite[name][row], late, refused_s)
-    refused = jnp.where(let_in, 0.0, ahead.refused + refused_s)
-    # Earlier samples must have used up the patience: a single one is refused whatever its period.
-    recovered = kept_out & ~let_in & (ahead.refused > system.model.patience_s)
-    gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
-    widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
-    return Gates(gated, jnp.where(recovered, 0.0, refused), recovered, widened)
-
-
-def _gate(sensor: Sensor, linear: Linear, prior: Array) -> tuple[Array, list[Array]]:
-    """Visible rows whose group lies outside its chi-square bound; and for each row how many times
-    larger than expected its group's squared error is."""
-    rows = linear.rows
-    cov = algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
-    cov = linalg.mask_covariance(cov, rows.mask)
-    outside: list[Any] = [None] * sensor.rows
-    ratios: list[Any] = [None] * sensor.rows
-    for members in sensor.group_rows:
-        residual = jnp.stack([rows.residual[i] for i in members])
-        shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
-        freedom = np.arange(1, len(members) + 1)
-        bounds = np.concatenate([[np.inf], chi2.ppf(sensor.gate, freedom)])
-        visible = written_sum([rows.mask[i].astype(int) for i in members])
-        distance = linalg.squared_distance(residual, shared)
-        bound = jnp.asarray(bounds[0], distance.dtype)
-        for count in freedom:
-            bound = jnp.where(visible == count, bounds[count], bound)
-        # A distance that is NaN is outside too: such a row must not enter the update.
-        rejected = jnp.logical_not(distance <= bound)
-        ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)
-        for row in members:
-            outside[row], ratios[row] = rejected, lax.stop_gradient(ratio)
-    return lax.stop_gradient(jnp.stack(outside) & rows.mask), ratios
-
-
-def _take(
+def take_block(
     slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool
 ) -> tuple[Gained, Array]:
+    """A block of rows taken at once, and the smallest pivot met."""
     if adjoint:
         return algebra.update_with_adjoint(slope, rows.noise.ndim == 2)(gained, rows)
     return algebra.update(slope, gained, rows)

@@ -149,12 +149,16 @@ class System:
     transition: Transition
     measurements: dict[str, Measurement]
     correction: Correction
+    again: Any = None
+    """What linearises updates again (`jaxekf.relinearise.Again`); None where once is enough."""
 
     def prepare(self, params: Any) -> dict[str, tuple[Array, ...]]:
         """What the steps need of the parameters, for one run."""
         found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
         found["transition"] = self.transition.piece.prepare(params)
         found["correction"] = self.correction.piece.prepare(params)
+        if self.again is not None:
+            found["again"] = self.again.prepare(params)
         return found
 
     @property
@@ -166,7 +170,8 @@ class System:
     def is_plain(self) -> bool:
         """Whether all functions of the model are arithmetic only, so that all steps are one program."""
         pieces = [m.piece for m in self.measurements.values()]
-        return all(p.is_plain for p in [*pieces, self.transition.piece, self.correction.piece])
+        pieces += [self.transition.piece, self.correction.piece]
+        return all(p.is_plain for p in pieces) and (self.again is None or self.again.is_plain)
 
 
 def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:

@@ -10,6 +10,11 @@ import jax
 import pytest
 from hypothesis import settings
 
+# Nearly all tests wait for the compiler, not for what it made. Those of the filter itself, and the long
+# forms, are compiled as users have it.
+if os.environ.get("JAXEKF_LONG") != "1":
+    os.environ.setdefault("JAXEKF_COMPILE", "quick")
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 

@@ -53,7 +53,27 @@ def _look(model, sensor, params, x, p, u, rows):
             inside = distance <= bounds[jnp.sum(rows.mask[members])]
             kept = kept.at[members].set(inside)
         mask = mask & lax.stop_gradient(kept)
+    if sensor.weighting is not None:
+        r = _enlarged(sensor, e, h @ p @ h.T + r, r, rows.mask)
     return e, h, r, mask
+
+
+def _enlarged(sensor, e, s, r, mask):
+    """The noise with each group's made larger the farther the group is off."""
+    scale = jnp.ones(sensor.rows)
+    for group in sensor.group_rows:
+        members = jnp.array(group)
+        seen = mask[members]
+        part = jnp.where(seen[:, None] & seen[None], s[members][:, members], jnp.eye(len(group)))
+        error = jnp.where(seen, e[members], 0.0)
+        square, count = error @ jnp.linalg.solve(part, error), jnp.sum(seen)
+        if sensor.weighting == "huber":
+            bound = jnp.array([1.0, *chi2.ppf(0.95, range(1, len(group) + 1))])[count]
+            larger = jnp.where(square > bound, jnp.sqrt(jnp.maximum(square, 1e-9) / bound), 1.0)
+        else:
+            larger = jnp.maximum((4.0 + square) / (4.0 + count), 1.0)
+        scale = scale.at[members].set(larger)
+    return r * jnp.sqrt(scale[:, None] * scale[None])
 
 
 def _update(model, params, x, p, u, samples):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxekf import ekf, jit
+from jaxekf import ekf, jit, kernels
 from jaxekf.model import Parameters
 from jaxekf.models import loose, loose_additive, loose_rate, tight
 from jaxekf.recording import Imu, Markers, Optical, Recording, from_scipy
@@ -40,7 +40,7 @@ def _quick_options():
 quick_jit = partial(jax.jit, compiler_options=_quick_options())
 
 # One compiled filter for each model and size, shared by all tests.
-run_filter = jit(ekf.run_filter, static_argnums=0)
+run_filter = jit(ekf.run_filter, static_argnums=0, compiler_options=kernels.FAST)
 run_filter_quick = quick_jit(ekf.run_filter, static_argnums=0)
 
 QUATERNION_ROWS = {"loose": 3, "loose_rate": 3, "loose_additive": 4}

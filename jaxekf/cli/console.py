@@ -15,6 +15,7 @@ from rich.table import Table
 from jaxekf.errors import JaxekfError
 from jaxekf.files import finite_or_null
 from jaxekf.models import REGISTRY
+from jaxekf.robust import MEANS
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
@@ -34,6 +35,14 @@ noise_option = click.option(
     multiple=True,
     type=click.Path(),
     help="noise.toml, calibration.toml, or a folder that holds them; repeatable.",
+)
+
+robust_option = click.option(
+    "--robust",
+    "means",
+    type=click.Choice(MEANS),
+    help="What to do with samples that do not fit: gate refuses them, huber and student let them count"
+    " less, none takes all in full.  [default: as the model has it]",
 )
 
 

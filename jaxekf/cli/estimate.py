@@ -16,6 +16,7 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    robust_option,
 )
 from jaxekf.diagnostics import Diagnosis, diagnose
 from jaxekf.errors import RecordingError
@@ -26,6 +27,7 @@ from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
+from jaxekf.robust import Means, robust
 
 
 def load_runs(paths: Sequence[Path]) -> list[Recording]:
@@ -68,6 +70,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @model_option
+@robust_option
 @noise_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("result"), show_default=True
@@ -96,6 +99,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 def estimate(
     runs: tuple[Path, ...],
     model: str,
+    means: Means | None,
     noise_files: tuple[str, ...],
     output: Path,
     online: bool,
@@ -110,7 +114,7 @@ def estimate(
             "got --online and --smooth, expected one of them: what was known at a time does not know the"
             " whole run; leave one out"
         )
-    chosen = get_model(model)
+    chosen = get_model(model) if means is None else robust(model, means)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs)
     for recording in recordings:

@@ -5,13 +5,21 @@ from pathlib import Path
 import click
 
 from jaxekf import parameters, plots
-from jaxekf.cli.console import json_option, model_option, noise_option, note, print_json
+from jaxekf.cli.console import (
+    json_option,
+    model_option,
+    noise_option,
+    note,
+    print_json,
+    robust_option,
+)
 from jaxekf.cli.estimate import load_runs
 from jaxekf.errors import ModelError
 from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
+from jaxekf.robust import Means, robust
 
 FIGURES = tuple(plots.figure_functions())
 
@@ -43,6 +51,7 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
     help="Which; repeatable.  [default: all]",
 )
 @model_option
+@robust_option
 @noise_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("figures"), show_default=True
@@ -52,6 +61,7 @@ def plot(
     runs: tuple[Path, ...],
     figures: tuple[str, ...],
     model: str,
+    means: Means | None,
     noise_files: tuple[str, ...],
     output: Path,
     as_json: bool,
@@ -62,7 +72,7 @@ def plot(
     longest time without a pose; path in three dimensions; of single markers visibility (used, refused,
     hidden) and innovations.
     """
-    chosen = get_model(model)
+    chosen = get_model(model) if means is None else robust(model, means)
     recordings = load_runs(runs)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []

@@ -1,0 +1,204 @@
+"""What is done with samples that do not fit: chi-square gates, and weights for heavy tails, on lanes."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from scipy.stats import chi2
+
+from jaxekf import algebra, linalg
+from jaxekf.lanes import written_sum
+from jaxekf.model import Sensor
+from jaxekf.patterned import Pattern
+from jaxekf.system import System
+from jaxekf.timeline import Rows
+
+_HUBER = 0.95
+"""Share of honest samples that Huber's weight leaves alone."""
+_STUDENT = 4.0
+"""Degrees of freedom of Student's law: its tails are heavy, its variance is finite."""
+
+
+class Linear(NamedTuple):
+    """One sensor linearised: rows, and the pattern of their slope."""
+
+    slope: Pattern
+    rows: algebra.Rows
+
+
+class Judged(NamedTuple):
+    """What gates and weights make of the samples of one instant."""
+
+    linear: dict[str, Linear]
+    """What is left: refused rows hidden, noise of what counts less made larger."""
+    gated: dict[str, Array]
+    """By sensor: (rows, lanes) visible rows that were refused."""
+    refused: Array | None
+    """(lanes,) as in `Track`; None without gates, as the others."""
+    recovered: Array | None
+    widened: Array | None
+    """(lanes,) what the predicted covariance is multiplied by."""
+
+
+class _Group(NamedTuple):
+    """Rows that are judged together, and their squared distance from what is predicted."""
+
+    members: tuple[int, ...]
+    visible: Array
+    distance: Array
+
+
+def judge(
+    system: System,
+    seen: dict[str, Linear],
+    samples: dict[str, Rows],
+    prior: Array,
+    refused: Array | None,
+) -> Judged:
+    """Rows that are kept out or count less, and the way back for a belief that keeps everything out.
+
+    Where gates have let nothing in while they refused samples for longer than the model's patience, it
+    is the belief that is wrong: the gates open once, and the covariance is multiplied by how many
+    times larger than expected the squared errors are. All samples then count in full.
+    """
+    sensors = {name: system.measurements[name].sensor for name in seen}
+    groups = {
+        name: _groups(sensors[name], linear, prior)
+        for name, linear in seen.items()
+        if sensors[name].gate is not None or sensors[name].weighting is not None
+    }
+    gated, after, recovered, widened = _gates(system, seen, samples, prior, refused, groups)
+    linear = {name: _without(one, gated[name]) for name, one in seen.items()}
+    for name in groups:
+        if sensors[name].weighting is None:
+            continue
+        larger = lessening(sensors[name], groups[name], linear[name].rows.mask.shape[0])
+        if recovered is not None:
+            larger = jnp.where(recovered, 1.0, larger)
+        linear[name] = _weighted(linear[name], larger)
+    return Judged(linear, gated, after, recovered, widened)
+
+
+def weights(sensor: Sensor, residual: Array, cov: Array, mask: Array) -> Array | None:
+    """How much each row of a sample counts, (rows,): what the filter divided its noise by; None for a
+    sensor without weighting. `cov` is the innovation's, hidden rows as in the identity."""
+    if sensor.weighting is None:
+        return None
+    groups = _distances(sensor, jnp.where(mask, residual, 0.0), cov, mask)
+    return 1.0 / lessening(sensor, groups, residual.shape[0])
+
+
+def lessening(sensor: Sensor, groups: list[_Group], rows: int) -> Array:
+    """What the noise of each row is multiplied by, (rows, ...), at least 1.
+
+    With the squared distance d2 of a group of m visible rows: ``sqrt(d2 / c)`` beyond the quantile c of
+    chi-square (Huber), ``(v + d2) / (v + m)`` (Student, v degrees of freedom).
+    """
+    found: list[Any] = [None] * rows
+    for members, visible, distance in groups:
+        if sensor.weighting == "student":
+            larger = jnp.maximum((_STUDENT + distance) / (_STUDENT + visible), 1.0)
+        else:
+            bound = _by_count(chi2.ppf(_HUBER, np.arange(1, len(members) + 1)), visible, distance)
+            larger = jnp.sqrt(jnp.maximum(distance / bound, 1.0))
+        for row in members:
+            found[row] = larger
+    return jnp.stack(found)
+
+
+def _by_count(bounds: Any, visible: Array, like: Array) -> Array:
+    """The bound for as many visible rows; of none, the first."""
+    found = jnp.full_like(like, bounds[0])
+    for count in range(2, len(bounds) + 1):
+        found = jnp.where(visible == count, bounds[count - 1], found)
+    return found
+
+
+def _weighted(linear: Linear, larger: Array) -> Linear:
+    noise = linear.rows.noise
+    if noise.ndim == larger.ndim:
+        noise = noise * larger
+    else:
+        root = jnp.sqrt(larger)
+        noise = noise * root[:, None] * root[None]
+    return linear._replace(rows=linear.rows._replace(noise=noise))
+
+
+def _without(linear: Linear, gated: Array) -> Linear:
+    return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
+
+
+def _gates(
+    system: System,
+    seen: dict[str, Linear],
+    samples: dict[str, Rows],
+    prior: Array,
+    refused: Array | None,
+    groups: dict[str, list[_Group]],
+) -> tuple[dict[str, Array], Array | None, Array | None, Array | None]:
+    """Rows refused, seconds of refusing, where the gates were opened, and by how much to widen."""
+    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in seen.items()}
+    watched = [n for n in seen if system.measurements[n].sensor.gate is not None]
+    none = jnp.zeros(prior.shape[-1], bool)
+    if refused is None:
+        return gated, None, None, None
+    if not watched:
+        return gated, refused, none, None
+    let_in, kept_out, finite = none, none, {}
+    refused_s, excess = jnp.zeros_like(refused), jnp.ones_like(refused)
+    for name in watched:
+        rows = seen[name].rows
+        gated[name], ratio = _gate(system.measurements[name].sensor, rows.mask, groups[name])
+        finite[name] = gated[name] & (jnp.stack(ratio) < jnp.inf)
+        for row in range(rows.mask.shape[0]):
+            let_in = let_in | (rows.mask[row] & ~gated[name][row])
+            kept_out = kept_out | finite[name][row]
+            larger = jnp.maximum(excess, ratio[row])
+            excess = jnp.where(finite[name][row], larger, excess)
+            late = jnp.maximum(refused_s, samples[name].dt)
+            refused_s = jnp.where(finite[name][row], late, refused_s)
+    after = jnp.where(let_in, 0.0, refused + refused_s)
+    # Earlier samples must have used up the patience: a single one is refused whatever its period.
+    recovered = kept_out & ~let_in & (refused > system.model.patience_s)
+    gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
+    widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
+    return gated, jnp.where(recovered, 0.0, after), recovered, widened
+
+
+def _groups(sensor: Sensor, linear: Linear, prior: Array) -> list[_Group]:
+    rows = linear.rows
+    # What is differentiated by closed forms counts on symmetric cotangents of covariances.
+    cov = linalg.symmetrise(
+        algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
+    )
+    return _distances(sensor, rows.residual, linalg.mask_covariance(cov, rows.mask), rows.mask)
+
+
+def _distances(sensor: Sensor, residual: Array, cov: Array, mask: Array) -> list[_Group]:
+    found = []
+    for members in sensor.group_rows:
+        part = jnp.stack([residual[i] for i in members])
+        shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
+        visible = written_sum([mask[i].astype(int) for i in members])
+        found.append(_Group(members, visible, linalg.squared_distance(part, shared)))
+    return found
+
+
+def _gate(sensor: Sensor, mask: Array, groups: list[_Group]) -> tuple[Array, list[Array]]:
+    """Visible rows whose group lies outside its chi-square bound; and for each row how many times
+    larger than expected its group's squared error is."""
+    outside: list[Any] = [None] * sensor.rows
+    ratios: list[Any] = [None] * sensor.rows
+    for members, visible, distance in groups:
+        freedom = np.arange(1, len(members) + 1)
+        bounds = np.concatenate([[np.inf], chi2.ppf(sensor.gate, freedom)])
+        bound = jnp.asarray(bounds[0], distance.dtype)
+        for count in freedom:
+            bound = jnp.where(visible == count, bounds[count], bound)
+        # A distance that is NaN is outside too: such a row must not enter the update.
+        rejected = jnp.logical_not(distance <= bound)
+        ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)
+        for row in members:
+            outside[row], ratios[row] = rejected, lax.stop_gradient(ratio)
+    return lax.stop_gradient(jnp.stack(outside) & mask), ratios

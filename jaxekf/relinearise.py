@@ -1,0 +1,114 @@
+"""The update linearised again about what it found, the prediction's covariance being the prior throughout.
+
+Iterated extended Kalman filter: Gauss-Newton for the most probable state given the prediction and the
+samples of one instant,
+
+    |local(x_predicted, x)|^2 / P + sum |local(h(x), z)|^2 / R
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxekf import algebra, linalg
+from jaxekf.about import AboutSystem
+from jaxekf.algebra import Gained
+from jaxekf.kernels import loop
+from jaxekf.model import Belief
+from jaxekf.outliers import Linear
+from jaxekf.step import any_of, blocks_of_rows, hide, take_block
+from jaxekf.system import System
+
+
+class Again:
+    """So many further linearisations, each about where the one before arrived."""
+
+    def __init__(self, system: AboutSystem, times: int) -> None:
+        self._system, self._times = system, times
+
+    def prepare(self, params: Any) -> Any:
+        """What it needs of the parameters, for one run."""
+        return self._system.prepare(params)
+
+    @property
+    def is_plain(self) -> bool:
+        """As `System.is_plain`."""
+        return self._system.is_plain
+
+    def __call__(
+        self,
+        prepared: Any,
+        prior: Belief,
+        found: Belief,
+        u: Any,
+        samples: Any,
+        linear: dict[str, Linear],
+        *,
+        adjoint: bool,
+    ) -> tuple[Belief, Array]:
+        """The posterior, from the one `found` at first, and the smallest pivot; on lanes.
+
+        `linear` tells which rows count and with what noise.
+        """
+        lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
+        posterior, smallest = found, jnp.ones(lanes, dtype)
+        for _ in range(self._times):
+            x = posterior.mean
+            away, changed = self._system.start(prepared["start"], prior.mean, x, adjoint=adjoint)
+            before = Gained(
+                turned(changed, prior.cov),
+                -loop(algebra.apply, changed, away),
+                jnp.zeros(lanes, dtype),
+            )
+            rows = self._looked(prepared, x, u, samples, linear, adjoint)
+            for slope, block in blocks_of_rows(self._system.measurements, rows):
+                before, pivot = take_block(slope, before, block, adjoint)
+                smallest = jnp.minimum(smallest, pivot)
+            moved, reset = self._system.move(prepared["move"], x, before.delta, adjoint=adjoint)
+            posterior = Belief(moved, turned(reset, before.cov))
+        used = any_of([one.rows.mask for one in linear.values()])
+        return _where(used, posterior, found), jnp.where(used, smallest, 1.0)
+
+    def _looked(
+        self, prepared: Any, x: Any, u: Any, samples: Any, linear: dict[str, Linear], adjoint: bool
+    ) -> dict[str, Linear]:
+        """Residuals and slopes at x, with the masks and the noise of the first look."""
+        rows = {}
+        for name, sample in samples.items():
+            measurement = self._system.measurements[name]
+            constants = prepared[f"sensor {name}"]
+            residual, slope, _ = measurement.piece(constants, x, u, sample, adjoint=adjoint)
+            first = linear[name].rows
+            rows[name] = hide(measurement, residual, slope, first.noise, first.mask)
+        return rows
+
+
+@lru_cache(maxsize=64)
+def again(system: AboutSystem, times: int) -> Again:
+    """The same object for the same arguments."""
+    return Again(system, times)
+
+
+@lru_cache(maxsize=64)
+def with_again(ready: System, more: Again) -> System:
+    """The system that linearises again; the same object for the same arguments."""
+    return replace(ready, again=more)
+
+
+def _where(used: Array, a: Belief, b: Belief) -> Belief:
+    """One belief or the other, lane by lane."""
+
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(used.reshape((1,) * (a.ndim - 1) + (-1,)), a, b)
+
+    return Belief(jax.tree.map(choose, a.mean, b.mean), choose(a.cov, b.cov))
+
+
+def turned(matrix: Array, cov: Array) -> Array:
+    """``M P M'``."""
+    half = loop(algebra.product, matrix, cov)
+    return loop(lambda h, m: linalg.symmetrise(algebra.product_transposed(h, m)), half, matrix)

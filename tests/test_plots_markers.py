@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -112,7 +113,8 @@ def test_what_is_missing_is_left_out(made, tmp_path):
     tracker = replace(raw, position=np.full_like(raw.position, np.nan))
     encoder = replace(recording.encoder, position=None)
     never = estimate.sensors["marker_2"]
-    never = type(never)(*(getattr(never, field)[:0] for field in never.__dataclass_fields__))
+    never = jax.tree.map(lambda a: a[:0], vars(never))
+    never = type(estimate.sensors["marker_2"])(**never)
     lacking = replace(estimate, sensors=estimate.sensors | {"marker_2": never})
     for name in NAMES:
         figure = plots.figure_functions()[name](
@@ -187,7 +189,7 @@ def test_angles_stay_on_the_turn_of_the_estimate():
     half = np.deg2rad(yaw) / 2.0
     q = np.stack([np.cos(half), 0.0 * t, 0.0 * t, np.sin(half)], axis=1)
     some = np.r_[0:20, 80:101]
-    shown = attitudes._same_turn(q[some], t[some], t, attitudes.euler_deg(q))
+    shown = attitudes.same_turn(q[some], t[some], t, attitudes.euler_deg(q))
     np.testing.assert_allclose(shown[:, 2], yaw[some], atol=1e-9)
 
 

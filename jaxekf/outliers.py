@@ -100,15 +100,17 @@ def lessening(sensor: Sensor, groups: list[_Group], rows: int) -> Array:
         if sensor.weighting == "student":
             larger = jnp.maximum((_STUDENT + distance) / (_STUDENT + visible), 1.0)
         else:
-            bound = _by_count(chi2.ppf(_HUBER, np.arange(1, len(members) + 1)), visible, distance)
+            bound = _bound(_HUBER, members, visible, distance)
             larger = jnp.sqrt(jnp.maximum(distance / bound, 1.0))
         for row in members:
             found[row] = larger
     return jnp.stack(found)
 
 
-def _by_count(bounds: Any, visible: Array, like: Array) -> Array:
-    """The bound for as many visible rows; of none, the first."""
+def _bound(share: Any, members: tuple[int, ...], visible: Array, like: Array) -> Array:
+    """Which a `share` of honest squared distances of as many visible rows does not exceed; where none is
+    visible, that of one."""
+    bounds = chi2.ppf(share, np.arange(1, len(members) + 1))
     found = jnp.full_like(like, bounds[0])
     for count in range(2, len(bounds) + 1):
         found = jnp.where(visible == count, bounds[count - 1], found)
@@ -191,11 +193,7 @@ def _gate(sensor: Sensor, mask: Array, groups: list[_Group]) -> tuple[Array, lis
     outside: list[Any] = [None] * sensor.rows
     ratios: list[Any] = [None] * sensor.rows
     for members, visible, distance in groups:
-        freedom = np.arange(1, len(members) + 1)
-        bounds = np.concatenate([[np.inf], chi2.ppf(sensor.gate, freedom)])
-        bound = jnp.asarray(bounds[0], distance.dtype)
-        for count in freedom:
-            bound = jnp.where(visible == count, bounds[count], bound)
+        bound = _bound(sensor.gate, members, visible, distance)
         # A distance that is NaN is outside too: such a row must not enter the update.
         rejected = jnp.logical_not(distance <= bound)
         ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)

@@ -29,6 +29,7 @@ from jaxekf.online import estimate_online
 from jaxekf.parameters import load as load_parameters
 from jaxekf.parameters import save as save_parameters
 from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, Samples
+from jaxekf.requested import Every, every
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.robust import robust
 from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
@@ -47,6 +48,7 @@ __all__ = [
     "Encoder",
     "Estimate",
     "Euclidean",
+    "Every",
     "Fault",
     "FilterError",
     "FilterOutput",
@@ -84,6 +86,7 @@ __all__ = [
     "estimate",
     "estimate_many",
     "estimate_online",
+    "every",
     "get_model",
     "initial_belief",
     "jit",

@@ -104,7 +104,8 @@ def diagnose_many(
 ) -> Diagnosis:
     """As `diagnose`, of several runs together: smaller faults are found, each run keeping its own bias.
 
-    Raises `ValueError` for no estimates, or other recordings than the estimates' own.
+    Raises `ValueError` for no estimates, for excerpts (`Estimate.at`), or other recordings than the
+    estimates' own.
     """
     _check(estimates, recordings)
     names = list(dict.fromkeys(name for made in estimates for name in made.sensors))
@@ -130,6 +131,11 @@ def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None
     if not estimates:
         raise ValueError(
             "got no estimates, expected at least one; pass those of jaxekf.estimate_many"
+        )
+    if excerpts := [made.run for made in estimates if made.excerpt]:
+        raise ValueError(
+            f"got excerpts of {excerpts}, expected whole estimates, whose states the innovations are"
+            " compared with; pass the estimate that Estimate.at was called on"
         )
     if recordings is not None:
         runs, given = [made.run for made in estimates], [r.name for r in recordings]

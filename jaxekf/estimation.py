@@ -18,6 +18,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.recording import NANOSECONDS, Recording
+from jaxekf.requested import Requested
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.timeline import Steps, Timeline
 
@@ -42,16 +43,22 @@ def estimate(
     params: Parameters | None = None,
     *,
     smooth: bool = False,
+    at: Requested | None = None,
 ) -> Estimate:
     """Estimate one run: a `Recording` or the path of a recorded folder.
 
     `model` is a name, ``module:attribute`` or a `Model`; `params` are the model's defaults unless
     given (see `jaxekf.load_parameters`). Each instant is estimated from what was measured until then
-    or, with `smooth`, from the whole run; innovations are those of the filter in both cases. Raises
-    `RecordingError` for what is wrong with the data, `FilterError` where the recursion broke,
-    `PrecisionError` in float32.
+    or, with `smooth`, from the whole run; innovations are those of the filter in both cases.
+
+    The instants are those at which something was measured and those of `at`: times (N,) in int64
+    nanoseconds on the recording's clock, or `jaxekf.every`. What was asked for is then had by
+    `Estimate.at`.
+
+    Raises `RecordingError` for what is wrong with the data or where nothing of `at` lies within the run,
+    `FilterError` where the recursion broke, `PrecisionError` in float32.
     """
-    return estimate_many([run], model, params, smooth=smooth)[0]
+    return estimate_many([run], model, params, smooth=smooth, at=at if at is None else [at])[0]
 
 
 def estimate_many(
@@ -60,12 +67,21 @@ def estimate_many(
     params: Parameters | None = None,
     *,
     smooth: bool = False,
+    at: Sequence[Requested | None] | None = None,
 ) -> list[Estimate]:
-    """Estimate several runs side by side with the same parameters; equal to one call for each."""
+    """Estimate several runs side by side with the same parameters; equal to one call for each.
+
+    `at` has an entry for each run. Raises `ValueError` where it has not, and what `estimate` raises.
+    """
     require_float64()
+    if at is not None and len(at) != len(runs):
+        raise ValueError(
+            f"got requested times for {len(at)} runs, expected as many as the {len(runs)} runs; pass an"
+            " entry for each, None where nothing is asked for"
+        )
     recordings = read(runs)
     chosen = adapted(get_model(model), recordings)
-    timelines = timeline.build_many(chosen, recordings)
+    timelines = timeline.build_many(chosen, recordings, at)
     used = parameters.as_arrays(chosen.parameters if params is None else params)
     parameters.check(used)
     results = filter_timelines(chosen, used, timelines, smooth=smooth)
@@ -276,6 +292,7 @@ def _collect(
         params=params._replace(setup=line.setup),
         notes=notes,
         smoothed=smooth,
+        requested_ns=line.requested_ns,
         # Absolute, so that it is found again from another working folder.
         provenance=provenance()
         | {"recording": str(recording.path.resolve() if recording.path else recording.name)},

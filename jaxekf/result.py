@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -100,6 +100,10 @@ class Estimate:
     provenance: dict[str, Any] = field(default_factory=dict)
     smoothed: bool = False
     """Whether every instant was estimated from the whole run, not from what was measured until then."""
+    requested_ns: Times | None = None
+    """Instants that were asked for by ``estimate(at=...)``, those within the run."""
+    excerpt: bool = False
+    """Whether it holds some of the run's instants only, see `at`."""
 
     @property
     def time(self) -> Floats:
@@ -141,6 +145,42 @@ class Estimate:
         """Name of each row of the covariance."""
         return manifold.error_labels(self.model.space)
 
+    def at(self, time_ns: Times | None = None) -> "Estimate":
+        """The same at some of its instants only, by default those that were asked for.
+
+        State, covariance and outputs are those of `time_ns` (N,), int64 nanoseconds; innovations, account
+        and likelihood stay the whole run's. Nothing is interpolated: raises `ValueError` for a time that is
+        no instant of the estimate.
+        """
+        wanted = self.requested_ns if time_ns is None else np.atleast_1d(time_ns)
+        if wanted is None:
+            raise ValueError(
+                "got no times, expected some because none were asked for; call estimate(..., at=times)"
+            )
+        place = np.minimum(np.searchsorted(self.time_ns, wanted), len(self.time_ns) - 1)
+        missing = np.flatnonzero(self.time_ns[place] != wanted)
+        if missing.size:
+            raise ValueError(
+                f"got the time {wanted[missing[0]]} ns and {missing.size - 1} others, expected instants of"
+                " the estimate (time_ns); ask for them by estimate(..., at=times)"
+            )
+
+        def pick(array: Any) -> Any:
+            return np.asarray(array)[place]
+
+        outputs = {
+            name: replace(out, value=pick(out.value), cov=pick(out.cov))
+            for name, out in self.outputs.items()
+        }
+        return replace(
+            self,
+            time_ns=self.time_ns[place],
+            state=jax.tree.map(pick, self.state),
+            cov=pick(self.cov),
+            outputs=outputs,
+            excerpt=True,
+        )
+
     def mean_nis(self, sensor: str) -> float:
         """Mean normalised innovation squared by degree of freedom; 1 where the noise is right."""
         record = self.sensors[sensor]
@@ -154,6 +194,7 @@ class Estimate:
             "model": self.model.name,
             "smoothed": self.smoothed,
             "instants": len(self.time_ns),
+            "requested": None if self.requested_ns is None else len(self.requested_ns),
             "duration_s": float(self.time[-1]),
             "log_likelihood": self.log_likelihood,
             "mean_nis": {
@@ -199,14 +240,18 @@ class Estimate:
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
         account, provenance and, where it is given, the `diagnosis` (`Diagnosis.as_dict`, with its curves
         for `jaxekf report`). `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
-        `estimate.h5`, ``tum`` `trajectory.tum`.
+        `estimate.h5`, ``tum`` `trajectory.tum`. Where instants were asked for, there is ``requested.csv``,
+        which is `estimate.csv` at those, and the `exports` hold those only.
         """
         added = export.files_of(path, exports)
+        exported = self
+        if self.requested_ns is not None and not self.excerpt:
+            exported, added = self.at(), {"csv": "requested.csv"} | added
         with whole_folder(path, "result.json", overwrite=overwrite) as folder:
             columns, _ = self._table()
             self._write("csv", folder / "estimate.csv")
             for form, name in added.items():
-                self._write(form, folder / name)
+                exported._write(form, folder / name)
             self._save_covariance(folder / "covariance.npz")
             for name, record in self.sensors.items():
                 labels = manifold.error_labels(self.model.sensor(name).space)

@@ -97,6 +97,18 @@ def need_columns(table: Table, *layouts: str) -> None:
     )
 
 
+def need_time(table: Table) -> None:
+    """There is a column ``time``, whatever else there is."""
+    if "time" not in table.columns:
+        raise RecordingError(
+            table.path,
+            f"columns {','.join(table.columns)}",
+            "one of the name time",
+            "adding or renaming it",
+            line=1,
+        )
+
+
 def numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
     """Columns as float64 (N, len(names)); with `blank`, empty cells are NaN."""
     values = np.empty((len(table.rows), len(names)))

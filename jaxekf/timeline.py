@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from jaxekf.errors import ModelError, RecordingError
 from jaxekf.model import Model, Sensor, Start
 from jaxekf.recording import NANOSECONDS, Recording, Samples, Times, period_ns
+from jaxekf.requested import Requested, within
+from jaxekf.streams import count, cut, first_visible, hold, take, visible
 
 _UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
 _LONGEST_EPOCH = 32
@@ -82,6 +84,8 @@ class Timeline:
     """`Parameters.setup` of this run."""
     latency_ns: dict[str, int] = field(default_factory=dict)
     """How late each sensor's samples were known."""
+    requested_ns: Times | None = None
+    """Instants that were asked for, each of them one of `time_ns`."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -89,29 +93,47 @@ class Timeline:
         return np.asarray(self.steps.valid)
 
 
-def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = None) -> Timeline:
+def build(
+    model: Model,
+    recording: Recording,
+    slow: tuple[str, ...] | None = None,
+    at: Requested | None = None,
+) -> Timeline:
     """The timeline of one recording for one model.
 
-    `slow` names the sensors that are sampled at the end of epochs only; None finds them.
+    `slow` names the sensors that are sampled at the end of epochs only; None finds them. `at` adds
+    instants at which nothing is measured; of times, those outside the run are left out, with a note.
 
-    Raises `RecordingError` where streams are missing or do not overlap, or where a sensor that the
-    model must start with is never seen.
+    Raises `RecordingError` where streams are missing or do not overlap, where a sensor that the
+    model must start with is never seen, or where all of `at` lies outside the run; `ModelError` for `at`
+    of a model whose steps are those of one stream (`Model.hold_to`).
     """
     samples = {s.name: _read(s, recording) for s in model.sensors}
     driver = None
     if model.input is not None:
         driver = _check_input(model.input.source(recording), recording, model.input.name)
     start, end, found = _span(model, recording, samples, driver)
-    account = {name: _count(stream, start, end) for name, stream in samples.items()}
+    account = {name: count(stream, start, end) for name, stream in samples.items()}
     if driver is not None and model.input is not None:
-        account[model.input.name] = _count(driver, start, end)
-    samples = {name: _cut(stream, start, end) for name, stream in samples.items()}
+        account[model.input.name] = count(driver, start, end)
+    samples = {name: cut(stream, start, end) for name, stream in samples.items()}
     if model.hold_to is not None:
-        samples = _hold(samples, model.hold_to, account)
+        samples = hold(samples, model.hold_to, account)
     events = [stream.time_ns for stream in samples.values()]
     if driver is not None:
         inside = (driver.time_ns >= start) & (driver.time_ns <= end)
         events.append(driver.time_ns[inside])
+    notes = (found.note,) if found is not None and found.note else ()
+    asked = None
+    if at is not None and model.hold_to is not None:
+        raise ModelError(
+            f"model '{model.name}' got times to estimate at, expected none because its steps are the"
+            f" samples of {model.hold_to}, and others would change it; take a model that holds nothing"
+        )
+    if at is not None:
+        asked, note = within(at, start, end, recording.path or recording.name)
+        events.append(asked)
+        notes += (note,) if note else ()
     times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
     if slow is None:
         slow = _slow_sensors(samples, times)
@@ -120,19 +142,30 @@ def build(model: Model, recording: Recording, slow: tuple[str, ...] | None = Non
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
     if found is None:
-        found = Start(start, {name: _first_visible(stream) for name, stream in samples.items()})
-    notes = (found.note,) if found.note else ()
+        found = Start(start, {name: first_visible(stream) for name, stream in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}
     setup = model.parameters.setup if model.setup is None else model.setup(recording)
-    return Timeline(recording.name, steps, step_times, found.first, account, notes, setup, latency)
+    return Timeline(
+        recording.name,
+        steps,
+        step_times,
+        found.first,
+        account,
+        notes,
+        setup,
+        latency,
+        asked,
+    )
 
 
-def build_many(model: Model, recordings: Sequence[Recording]) -> list[Timeline]:
-    """Timelines of several recordings, laid out alike so that they can be stacked."""
+def build_many(
+    model: Model, recordings: Sequence[Recording], at: Sequence[Requested | None] | None = None
+) -> list[Timeline]:
+    """Timelines of several recordings, laid out alike so that they can be stacked; `at` for each."""
     timelines: list[Timeline] = []
-    for recording in recordings:
+    for recording, asked in zip(recordings, at or [None] * len(recordings), strict=True):
         slow = tuple(timelines[0].steps.slow) if timelines else None
-        timelines.append(build(model, recording, slow))
+        timelines.append(build(model, recording, slow, asked))
     return timelines
 
 
@@ -164,8 +197,8 @@ def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recor
     """
     values = np.array(values)
     known = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    visible = mask.any(axis=1)
-    bad = np.flatnonzero(visible & ~known)
+    shown = mask.any(axis=1)
+    bad = np.flatnonzero(shown & ~known)
     if bad.size:
         raise RecordingError(
             recording.path or recording.name,
@@ -179,7 +212,7 @@ def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recor
 
 def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
     """The input's valid samples; an input cannot be masked, so that a long gap in it is an error."""
-    driver = _take(driver, np.asarray(driver.mask))
+    driver = take(driver, np.asarray(driver.mask))
     place = recording.path or recording.name
     count = len(driver.time_ns)
     if count < 2:
@@ -197,17 +230,6 @@ def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
             "cutting the run there, or a model that measures it (loose_rate)",
         )
     return driver
-
-
-def _visible(samples: Samples) -> NDArray[np.bool_]:
-    return np.asarray(samples.mask.reshape(len(samples.mask), -1).any(axis=1))
-
-
-def _first_visible(samples: Samples) -> Any:
-    seen = np.flatnonzero(_visible(samples))
-    if seen.size == 0:
-        return None
-    return jax.tree.map(lambda a: np.asarray(a)[seen[0]], samples.value)
 
 
 def _describe(times: Times) -> str:
@@ -236,7 +258,7 @@ def _span(
         _check_overlap(place, samples)
     for name in model.start_with:
         stream = samples[name]
-        seen = stream.time_ns[_visible(stream) & (stream.time_ns >= start)]
+        seen = stream.time_ns[visible(stream) & (stream.time_ns >= start)]
         if seen.size == 0 or seen[0] > end:
             raise RecordingError(
                 place,
@@ -247,7 +269,7 @@ def _span(
         start = max(start, int(seen[0]))
     if model.find_start is None:
         return start, end, None
-    inside = {name: _cut(stream, start, end) for name, stream in samples.items()}
+    inside = {name: cut(stream, start, end) for name, stream in samples.items()}
     found = model.find_start(recording, inside)
     if found is None:
         raise RecordingError(
@@ -270,75 +292,6 @@ def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
                 "streams that overlap in time",
                 "checking the clocks and units of both",
             )
-
-
-def _count(samples: Samples, start: int, end: int) -> dict[str, int]:
-    inside = (samples.time_ns >= start) & (samples.time_ns <= end)
-    visible = _visible(samples)
-    return {
-        "read": len(samples.time_ns),
-        "fed": int((inside & visible).sum()),
-        "masked": int((inside & ~visible).sum()),
-        "dropped_outside_run": int((~inside).sum()),
-    }
-
-
-def _take(samples: Samples, chosen: NDArray[Any]) -> Samples:
-    def pick(tree: Any) -> Any:
-        return jax.tree.map(lambda a: np.asarray(a)[chosen], tree)
-
-    return Samples(
-        samples.time_ns[chosen],
-        pick(samples.value),
-        samples.mask[chosen],
-        pick(samples.aux),
-        samples.latency_ns,
-    )
-
-
-def _cut(samples: Samples, start: int, end: int) -> Samples:
-    return _take(samples, (samples.time_ns >= start) & (samples.time_ns <= end))
-
-
-def _hold(
-    samples: dict[str, Samples], leader: str, account: dict[str, dict[str, int]]
-) -> dict[str, Samples]:
-    """Every stream held (zero order) on the leader's sampling instants; gaps of the leader are
-    filled at its nominal period, with its own rows masked there."""
-    led = samples[leader]
-    grid = fill_gaps(led.time_ns)
-    position = np.searchsorted(led.time_ns, grid, side="right") - 1
-    present = led.time_ns[position] == grid
-    held = {leader: _take(led, position)}
-    held[leader] = Samples(
-        grid, held[leader].value, held[leader].mask & present[:, None], held[leader].aux
-    )
-    for name, stream in samples.items():
-        if name == leader:
-            continue
-        last = np.searchsorted(stream.time_ns, grid, side="right") - 1
-        taken = _take(stream, np.maximum(last, 0))
-        # A stream that has stopped is not held for ever, but for a period and a half of the slower.
-        oldest = 1.5 * max(period_ns(grid), period_ns(stream.time_ns))
-        fresh = (last >= 0) & (grid - taken.time_ns <= oldest)
-        held[name] = Samples(grid, taken.value, taken.mask & fresh[:, None], taken.aux)
-        used = len(np.unique(last[_visible(held[name])]))
-        account[name]["dropped_by_holding"] = account[name]["fed"] - used
-        account[name]["fed"] = used
-    return held
-
-
-def fill_gaps(time_ns: Times) -> Times:
-    """Times with every gap longer than 1.5 nominal periods filled at the nominal period."""
-    period = period_ns(time_ns)
-    if period == 0:
-        return time_ns
-    pieces = [time_ns]
-    steps = np.diff(time_ns)
-    for i in np.flatnonzero(steps > 1.5 * period):
-        count = round(steps[i] / period)
-        pieces.append(time_ns[i] + period * np.arange(1, count, dtype=np.int64))
-    return np.unique(np.concatenate(pieces))
 
 
 def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:
@@ -395,7 +348,7 @@ def _rows(samples: Samples, asked: Times) -> Rows:
     since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal)
     # After a dropout a sample has not averaged over the gap: its own period is the nominal one.
     since = np.minimum(since, nominal) / NANOSECONDS
-    taken = _take(samples, at)
+    taken = take(samples, at)
     return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
 
 

@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     ("errors",),
     ("rotation", "linalg", "recording", "files"),
-    ("manifold", "tables", "truth", "description"),
-    ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export"),
+    ("manifold", "tables", "truth", "description", "streams"),
+    ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
     ("timeline",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),

@@ -18,7 +18,7 @@ from jaxekf.cli.console import (
     print_table,
     robust_option,
 )
-from jaxekf.diagnostics import Diagnosis, diagnose
+from jaxekf.diagnostics import Diagnosis, diagnose, diagnose_many
 from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
 from jaxekf.export import FILES
@@ -26,6 +26,7 @@ from jaxekf.files import check_output
 from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
+from jaxekf.requested import Requested, every, read_requested
 from jaxekf.result import Estimate
 from jaxekf.robust import Means, robust
 
@@ -94,6 +95,20 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     help="A further file in each result folder: everything as estimate.npz or estimate.h5, the path as"
     " trajectory.tum; repeatable.",
 )
+@click.option(
+    "--at",
+    "times_file",
+    type=click.Path(path_type=Path),
+    help="Estimate also at the times of this CSV file's column time, seconds on the recording's clock:"
+    " writes requested.csv, and exports hold these times only.",
+)
+@click.option(
+    "--every",
+    "distance",
+    type=click.FloatRange(min=1e-9, max=1e9),
+    metavar="SECONDS",
+    help="As --at, on a regular grid from the first instant of each run on.",
+)
 @overwrite_option
 @json_option
 def estimate(
@@ -105,6 +120,8 @@ def estimate(
     online: bool,
     smooth: bool,
     exports: tuple[str, ...],
+    times_file: Path | None,
+    distance: float | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -114,6 +131,12 @@ def estimate(
             "got --online and --smooth, expected one of them: what was known at a time does not know the"
             " whole run; leave one out"
         )
+    requested = _requested(times_file, distance)
+    if online and requested is not None:
+        raise click.UsageError(
+            "got --online and times to estimate at, expected one of them: what was known is told at the"
+            " samples of the IMU; leave one out, or feed a jaxekf.Stream"
+        )
     chosen = get_model(model) if means is None else robust(model, means)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs)
@@ -122,7 +145,8 @@ def estimate(
     if online:
         estimates = [estimate_online(recording, chosen, params) for recording in recordings]
     else:
-        estimates = estimate_many(recordings, chosen, params, smooth=smooth)
+        at = None if requested is None else [requested] * len(recordings)
+        estimates = estimate_many(recordings, chosen, params, smooth=smooth, at=at)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         diagnosis = diagnose(made, recording)
@@ -135,11 +159,28 @@ def estimate(
         summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
         warn(made, diagnosis)
         note(f"wrote {folder}")
+    document = {"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries}
+    if len(recordings) > 1:
+        pooled = diagnose_many(estimates, recordings)
+        document["diagnosis"] = pooled.as_dict()
+        for text in (*pooled.sentences(), *pooled.notes):
+            note(f"all {len(recordings)} runs together: {text}")
     if as_json:
-        print_json({"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries})
+        print_json(document)
         return
     known = ", as known at each time" if online else ", smoothed" if smooth else ""
     _print_estimates(f"Estimates by {chosen.name}{known}", summaries)
+
+
+def _requested(times_file: Path | None, distance: float | None) -> Requested | None:
+    """The instants that were asked for by one of two options."""
+    if times_file is not None and distance is not None:
+        raise click.UsageError(
+            "got --at and --every, expected one of them, since each says which times; leave one out"
+        )
+    if times_file is not None:
+        return read_requested(times_file)
+    return None if distance is None else every(distance)
 
 
 def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:

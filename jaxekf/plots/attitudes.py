@@ -21,7 +21,7 @@ from jaxekf.plots.style import (
 )
 from jaxekf.recording import Encoder, Flags, Floats, Recording, to_scipy
 from jaxekf.result import Estimate
-from jaxekf.timeline import fill_gaps
+from jaxekf.streams import fill_gaps
 from jaxekf.truth import encoder_at
 
 _ANGLES = ("roll", "pitch", "yaw")

@@ -104,7 +104,7 @@ def diagnose_many(
 ) -> Diagnosis:
     """As `diagnose`, of several runs together: smaller faults are found, each run keeping its own bias.
 
-    Raises `ValueError` for no estimates, for excerpts (`Estimate.at`), or other recordings than the
+    Raises `ValueError` for no estimates, for excerpts (`Estimate.requested`), or other recordings than the
     estimates' own.
     """
     _check(estimates, recordings)
@@ -134,8 +134,8 @@ def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None
         )
     if excerpts := [made.run for made in estimates if made.excerpt]:
         raise ValueError(
-            f"got excerpts of {excerpts}, expected whole estimates, whose states the innovations are"
-            " compared with; pass the estimate that Estimate.at was called on"
+            f"got requested times of {excerpts} only, expected whole estimates, whose states the"
+            " innovations are compared with; pass the estimates that they are a part of"
         )
     if recordings is not None:
         runs, given = [made.run for made in estimates], [r.name for r in recordings]

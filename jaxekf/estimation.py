@@ -18,7 +18,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.recording import NANOSECONDS, Recording
-from jaxekf.requested import Requested
+from jaxekf.requested import Every, Requested
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.timeline import Steps, Timeline
 
@@ -51,9 +51,8 @@ def estimate(
     given (see `jaxekf.load_parameters`). Each instant is estimated from what was measured until then
     or, with `smooth`, from the whole run; innovations are those of the filter in both cases.
 
-    The instants are those at which something was measured and those of `at`: times (N,) in int64
-    nanoseconds on the recording's clock, or `jaxekf.every`. What was asked for is then had by
-    `Estimate.at`.
+    The instants are those at which something was measured. `at` asks for others: times (N,) in int64
+    nanoseconds on the recording's clock, or `jaxekf.every`; the estimate at these is `Estimate.requested`.
 
     Raises `RecordingError` for what is wrong with the data or where nothing of `at` lies within the run,
     `FilterError` where the recursion broke, `PrecisionError` in float32.
@@ -67,13 +66,16 @@ def estimate_many(
     params: Parameters | None = None,
     *,
     smooth: bool = False,
-    at: Sequence[Requested | None] | None = None,
+    at: Sequence[Requested | None] | Every | None = None,
 ) -> list[Estimate]:
     """Estimate several runs side by side with the same parameters; equal to one call for each.
 
-    `at` has an entry for each run. Raises `ValueError` where it has not, and what `estimate` raises.
+    `at` has an entry for each run, or is one grid for all. Raises `ValueError` where it is neither, and
+    what `estimate` raises.
     """
     require_float64()
+    if isinstance(at, Every):
+        at = [at] * len(runs)
     if at is not None and len(at) != len(runs):
         raise ValueError(
             f"got requested times for {len(at)} runs, expected as many as the {len(runs)} runs; pass an"
@@ -274,12 +276,14 @@ def _collect(
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
         notes += (
             f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
-            f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times",
+            f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times;"
+            " if these samples are good, the noise is too small for so strict a gate: tune it, or take"
+            " weights instead (robust: huber)",
         )
     if smooth:
         notes += ("smoothed: every instant is estimated from the whole run",)
     total = float(flat(output.instants.log_likelihood).sum())
-    return Estimate(
+    made = Estimate(
         run=recording.name,
         model=model,
         time_ns=line.time_ns[valid],
@@ -292,11 +296,13 @@ def _collect(
         params=params._replace(setup=line.setup),
         notes=notes,
         smoothed=smooth,
-        requested_ns=line.requested_ns,
         # Absolute, so that it is found again from another working folder.
         provenance=provenance()
         | {"recording": str(recording.path.resolve() if recording.path else recording.name)},
     )
+    if line.requested_ns is None or line.measured_ns is None:
+        return made
+    return made.split(np.isin(made.time_ns, line.measured_ns), line.requested_ns)
 
 
 def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:

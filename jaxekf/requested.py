@@ -14,14 +14,22 @@ from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Times
 from jaxekf.tables import need_time, read_table, read_times
 
-_MOST = 20_000_000
+_MOST = 5_000_000
 
 
 @dataclass(frozen=True)
 class Every:
-    """A regular grid of instants from the first of a run on; see `every`."""
+    """A regular grid of instants from the first of a run on; see `every`. Raises `ValueError` for a period
+    that is no positive whole number."""
 
     period_ns: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.period_ns, int) or self.period_ns < 1:
+            raise ValueError(
+                f"got a period of {self.period_ns!r} ns, expected a whole number of at least 1; see"
+                " jaxekf.every, which takes seconds"
+            )
 
 
 Requested = Times | Every
@@ -33,7 +41,7 @@ def every(seconds: float) -> Every:
 
     Raises `ValueError` for a distance that is not at least a nanosecond.
     """
-    period = seconds * NANOSECONDS
+    period = float(seconds) * NANOSECONDS
     if not 1.0 <= period < np.inf:
         raise ValueError(
             f"got a distance of {seconds} s, expected a nanosecond or more; pass seconds, such as 0.01"
@@ -43,6 +51,8 @@ def every(seconds: float) -> Every:
 
 def read_requested(path: Path | str) -> Times:
     """The column ``time`` of a CSV file, decimal seconds on the recording's clock; others are not read."""
+    if not Path(path).is_file():
+        raise RecordingError(path, "no such file", "a CSV file of times", "another path")
     table = read_table(Path(path))
     need_time(table)
     return read_times(table)
@@ -64,11 +74,11 @@ def within(asked: Any, start: int, end: int, place: Path | str) -> tuple[Times, 
             )
         return start + asked.period_ns * np.arange(count, dtype=np.int64), None
     times = np.asarray(asked)
-    if times.ndim != 1 or not np.issubdtype(times.dtype, np.integer):
+    if times.ndim != 1 or times.dtype.kind not in "iu" or np.ma.isMaskedArray(asked):
         raise RecordingError(
             place,
-            f"requested times of type {times.dtype} and shape {times.shape}",
-            "int64 nanoseconds on the recording's clock, shape (N,)",
+            f"requested times of type {times.dtype} and shape {times.shape}, or masked",
+            "int64 nanoseconds on the recording's clock, shape (N,), none masked",
             "np.round(seconds * 1e9).astype(np.int64), or jaxekf.every(seconds)",
         )
     times = times.astype(np.int64)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxekf import export, manifold, parameters
-from jaxekf.errors import ModelError
+from jaxekf.errors import ModelError, RecordingError
 from jaxekf.export import Entry
 from jaxekf.files import finite_or_null, whole_file, whole_folder
 from jaxekf.manifold import Manifold
@@ -100,15 +100,20 @@ class Estimate:
     provenance: dict[str, Any] = field(default_factory=dict)
     smoothed: bool = False
     """Whether every instant was estimated from the whole run, not from what was measured until then."""
-    requested_ns: Times | None = None
-    """Instants that were asked for by ``estimate(at=...)``, those within the run."""
+    online: bool = False
+    """Whether it is what was known at each time, measurements being late."""
+    requested: "Estimate | None" = None
+    """The same at the times asked for by ``estimate(at=...)``, an excerpt."""
     excerpt: bool = False
-    """Whether it holds some of the run's instants only, see `at`."""
+    """Whether its instants are those of a request: it is read and exported, but not judged or saved."""
+    start_ns: int | None = None
+    """Where `time` is zero; None for the first instant."""
 
     @property
     def time(self) -> Floats:
-        """Seconds since the first instant."""
-        return (self.time_ns - self.time_ns[0]) / NANOSECONDS
+        """Seconds since the first instant of the run."""
+        start = self.time_ns[0] if self.start_ns is None else self.start_ns
+        return (self.time_ns - start) / NANOSECONDS
 
     @property
     def attitude(self) -> OutputEstimate:
@@ -145,41 +150,24 @@ class Estimate:
         """Name of each row of the covariance."""
         return manifold.error_labels(self.model.space)
 
-    def at(self, time_ns: Times | None = None) -> "Estimate":
-        """The same at some of its instants only, by default those that were asked for.
+    def split(self, measured: Any, requested_ns: Times) -> "Estimate":
+        """Only the instants that are `measured` (N,), and as `requested` those at the given times.
 
-        State, covariance and outputs are those of `time_ns` (N,), int64 nanoseconds; innovations, account
-        and likelihood stay the whole run's. Nothing is interpolated: raises `ValueError` for a time that is
-        no instant of the estimate.
+        Innovations, account and likelihood stay the whole run's in both.
         """
-        wanted = self.requested_ns if time_ns is None else np.atleast_1d(time_ns)
-        if wanted is None:
-            raise ValueError(
-                "got no times, expected some because none were asked for; call estimate(..., at=times)"
-            )
-        place = np.minimum(np.searchsorted(self.time_ns, wanted), len(self.time_ns) - 1)
-        missing = np.flatnonzero(self.time_ns[place] != wanted)
-        if missing.size:
-            raise ValueError(
-                f"got the time {wanted[missing[0]]} ns and {missing.size - 1} others, expected instants of"
-                " the estimate (time_ns); ask for them by estimate(..., at=times)"
-            )
 
-        def pick(array: Any) -> Any:
-            return np.asarray(array)[place]
+        def pick(at: Any) -> dict[str, Any]:
+            outputs = {
+                name: replace(out, value=np.asarray(out.value)[at], cov=np.asarray(out.cov)[at])
+                for name, out in self.outputs.items()
+            }
+            state = jax.tree.map(lambda a: np.asarray(a)[at], self.state)
+            chosen = {"time_ns": self.time_ns[at], "state": state, "cov": self.cov[at]}
+            return chosen | {"outputs": outputs}
 
-        outputs = {
-            name: replace(out, value=pick(out.value), cov=pick(out.cov))
-            for name, out in self.outputs.items()
-        }
-        return replace(
-            self,
-            time_ns=self.time_ns[place],
-            state=jax.tree.map(pick, self.state),
-            cov=pick(self.cov),
-            outputs=outputs,
-            excerpt=True,
-        )
+        asked = np.searchsorted(self.time_ns, requested_ns)
+        excerpt = replace(self, **pick(asked), excerpt=True, start_ns=int(self.time_ns[0]))
+        return replace(self, **pick(np.flatnonzero(measured)), requested=excerpt)
 
     def mean_nis(self, sensor: str) -> float:
         """Mean normalised innovation squared by degree of freedom; 1 where the noise is right."""
@@ -193,8 +181,9 @@ class Estimate:
             "run": self.run,
             "model": self.model.name,
             "smoothed": self.smoothed,
+            "online": self.online,
             "instants": len(self.time_ns),
-            "requested": None if self.requested_ns is None else len(self.requested_ns),
+            "requested": None if self.requested is None else len(self.requested.time_ns),
             "duration_s": float(self.time[-1]),
             "log_likelihood": self.log_likelihood,
             "mean_nis": {
@@ -240,13 +229,22 @@ class Estimate:
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
         account, provenance and, where it is given, the `diagnosis` (`Diagnosis.as_dict`, with its curves
         for `jaxekf report`). `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
-        `estimate.h5`, ``tum`` `trajectory.tum`. Where instants were asked for, there is ``requested.csv``,
-        which is `estimate.csv` at those, and the `exports` hold those only.
+        `estimate.h5`, ``tum`` `trajectory.tum`. Where times were asked for, there is ``requested.csv``,
+        with the columns of `estimate.csv` at those, and the `exports` hold those only.
+
+        Raises `RecordingError` for an output that exists, and for an excerpt.
         """
+        if self.excerpt:
+            raise RecordingError(
+                path,
+                "an estimate at requested times only",
+                "one of the whole run",
+                "saving the estimate it is a part of, or exporting this one to a file",
+            )
         added = export.files_of(path, exports)
         exported = self
-        if self.requested_ns is not None and not self.excerpt:
-            exported, added = self.at(), {"csv": "requested.csv"} | added
+        if self.requested is not None:
+            exported, added = self.requested, {"csv": "requested.csv"} | added
         with whole_folder(path, "result.json", overwrite=overwrite) as folder:
             columns, _ = self._table()
             self._write("csv", folder / "estimate.csv")
@@ -298,6 +296,7 @@ class Estimate:
             "run": self.run,
             "model": self.model.name,
             "smoothed": self.smoothed,
+            "requested_times_only": self.excerpt,
             "log_likelihood": self.log_likelihood,
         }
         found = {"": Entry(None, facts), "time_ns": Entry(self.time_ns, {"unit": "ns"})}

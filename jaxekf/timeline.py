@@ -86,6 +86,8 @@ class Timeline:
     """How late each sensor's samples were known."""
     requested_ns: Times | None = None
     """Instants that were asked for, each of them one of `time_ns`."""
+    measured_ns: Times | None = None
+    """Where some were asked for, the instants that there would be without."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -124,7 +126,7 @@ def build(
         inside = (driver.time_ns >= start) & (driver.time_ns <= end)
         events.append(driver.time_ns[inside])
     notes = (found.note,) if found is not None and found.note else ()
-    asked = None
+    asked = measured = None
     if at is not None and model.hold_to is not None:
         raise ModelError(
             f"model '{model.name}' got times to estimate at, expected none because its steps are the"
@@ -132,6 +134,7 @@ def build(
         )
     if at is not None:
         asked, note = within(at, start, end, recording.path or recording.name)
+        measured = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
         events.append(asked)
         notes += (note,) if note else ()
     times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
@@ -155,6 +158,7 @@ def build(
         setup,
         latency,
         asked,
+        measured,
     )
 
 
@@ -163,7 +167,8 @@ def build_many(
 ) -> list[Timeline]:
     """Timelines of several recordings, laid out alike so that they can be stacked; `at` for each."""
     timelines: list[Timeline] = []
-    for recording, asked in zip(recordings, at or [None] * len(recordings), strict=True):
+    at = [None] * len(recordings) if at is None else at
+    for recording, asked in zip(recordings, at, strict=True):
         slow = tuple(timelines[0].steps.slow) if timelines else None
         timelines.append(build(model, recording, slow, asked))
     return timelines

@@ -61,38 +61,45 @@ def test_equals_a_hidden_sample(model, smooth, tool):
     plain = jaxekf.estimate(recording, model, smooth=smooth)
     times = asked_of(plain)
     made = jaxekf.estimate(recording, model, smooth=smooth, at=times)
-    found = made.at()
+    found = made.requested
     np.testing.assert_array_equal(found.time_ns, times)
-    hidden = jaxekf.estimate(hidden_at(recording, times), model, smooth=smooth).at(times)
+    np.testing.assert_array_equal(found.time, (times - plain.time_ns[0]) / 1e9)
+    hidden = jaxekf.estimate(hidden_at(recording, times), model, smooth=smooth)
+    at = np.searchsorted(hidden.time_ns, times)
     for one, other in zip(
         jax.tree.leaves((found.state, found.cov)),
         jax.tree.leaves((hidden.state, hidden.cov)),
         strict=True,
     ):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
-    # At the instants that there were before: as good as equal; steps cut in two are integrated better.
-    kept = made.at(plain.time_ns)
-    error = kept.attitude.value - plain.attitude.value
+        np.testing.assert_allclose(one, other[at], rtol=0, atol=1e-12 * np.abs(other).max())
+    # What was not asked for is as good as equal; steps cut in two are integrated better.
+    np.testing.assert_array_equal(made.time_ns, plain.time_ns)
+    error = made.attitude.value - plain.attitude.value
     assert np.abs(error).max() < 0.05 * plain.attitude.sigma.min()
-    np.testing.assert_allclose(kept.cov, plain.cov, rtol=0, atol=0.02 * plain.cov.max())
+    np.testing.assert_allclose(made.cov, plain.cov, rtol=0, atol=0.02 * plain.cov.max())
+    one, other = (jaxekf.score(e, recording) for e in (made, plain))
+    assert one.samples == other.samples
+    np.testing.assert_allclose(one, other, rtol=0.02)
 
 
 def test_regular_grid_of_many_runs():
     """Would catch a grid that begins or ends elsewhere, and times of one run asked of another."""
     runs = [jaxekf.load(demo.FOLDER / name) for name in ("free-4", "free-5")]
     grid = jaxekf.every(0.0123)
+    all_on_it = jaxekf.estimate_many(runs, at=grid)
     times = runs[1].need_imu().time_ns[100:110] + 77
     both = jaxekf.estimate_many(runs, at=[grid, times])
-    np.testing.assert_array_equal(both[1].at().time_ns, times)
+    np.testing.assert_array_equal(both[1].requested.time_ns, times)
     first, last = both[0].time_ns[0], both[0].time_ns[-1]
-    asked = both[0].requested_ns
+    asked = both[0].requested.time_ns
     assert asked[0] == first
     assert set(np.diff(asked)) == {12_300_000}
     assert 0 <= last - asked[-1] < 12_300_000
-    assert both[0].at().excerpt
+    assert both[0].requested.excerpt
     assert not both[0].excerpt
-    alone = jaxekf.estimate(runs[1], at=times).at()
-    np.testing.assert_allclose(both[1].at().cov, alone.cov, rtol=1e-10, atol=0)
+    np.testing.assert_array_equal(all_on_it[0].requested.time_ns, asked)
+    alone = jaxekf.estimate(runs[1], at=times).requested
+    np.testing.assert_allclose(both[1].requested.cov, alone.cov, rtol=1e-10, atol=0)
 
 
 def test_what_lies_outside_is_said():
@@ -101,7 +108,7 @@ def test_what_lies_outside_is_said():
     outside = np.array([whole.time_ns[0] - 1, whole.time_ns[-1] + 5])
     times = np.sort(np.append(outside, whole.time_ns[10]))
     made = jaxekf.estimate(RUN, at=times)
-    assert list(made.requested_ns) == [whole.time_ns[10]]
+    assert list(made.requested.time_ns) == [whole.time_ns[10]]
     assert any("2 of 3 requested times lie outside the run" in note for note in made.notes)
     for bad, words in (
         (outside, "expected some within the run"),
@@ -109,6 +116,8 @@ def test_what_lies_outside_is_said():
         (times[::-1], "do not increase"),
         (np.array([], np.int64), "no requested times"),
         (jaxekf.every(1e-9), "no more than"),
+        (np.array([1], "timedelta64[s]"), "expected int64 nanoseconds"),
+        (np.ma.array([1, 2], mask=[True, False]), "none masked"),
     ):
         with pytest.raises(RecordingError, match=words):
             jaxekf.estimate(RUN, at=bad)
@@ -116,22 +125,22 @@ def test_what_lies_outside_is_said():
         jaxekf.estimate(RUN, "loose_additive", at=times)
     with pytest.raises(ValueError, match="requested times for 1 runs"):
         jaxekf.estimate_many([RUN, RUN], at=[times])
-    with pytest.raises(ValueError, match="a nanosecond or more"):
-        jaxekf.every(0.0)
+    for seconds in (0.0, float("nan")):
+        with pytest.raises(ValueError, match="a nanosecond or more"):
+            jaxekf.every(seconds)
+    with pytest.raises(ValueError, match="a whole number of at least 1"):
+        jaxekf.Every(-1)
 
 
-def test_an_excerpt_is_not_judged():
-    """Would catch interpolation where there is no instant, and innovations laid beside other states."""
-    made = jaxekf.estimate(RUN)
-    with pytest.raises(ValueError, match="none were asked for"):
-        made.at()
-    with pytest.raises(ValueError, match="and 1 others"):
-        made.at(made.time_ns[3:5] + 1)
-    few = made.at(made.time_ns[::7])
-    np.testing.assert_array_equal(few.bias.value, made.bias.value[::7])
-    np.testing.assert_array_equal(few.rate.cov, made.rate.cov[::7])
+def test_an_excerpt_is_exported_only(tmp_path):
+    """Would catch innovations laid beside other states, and a result that lacks its instants."""
+    made = jaxekf.estimate(RUN, at=jaxekf.every(0.5))
     with pytest.raises(ValueError, match="expected whole estimates"):
-        jaxekf.diagnose(few)
+        jaxekf.diagnose(made.requested)
+    with pytest.raises(RecordingError, match="requested times only"):
+        made.requested.save(tmp_path / "result")
+    assert jaxekf.read_export(made.requested.export(tmp_path / "a.npz"))["requested_times_only"]
+    assert not jaxekf.read_export(made.export(tmp_path / "b.h5"))["requested_times_only"]
 
 
 def call(*arguments):
@@ -154,8 +163,8 @@ def test_command_line(tmp_path):
     table = tables.read_table(folder / "requested.csv")
     np.testing.assert_array_equal(tables.read_times(table), times[1])
     found = tables.finite_numbers(table, ("q_ref_body_w", "bias_z"))
-    np.testing.assert_allclose(found[:, 0], made.at().state.q_ref_body[:, 0], atol=1e-11)
-    np.testing.assert_allclose(found[:, 1], made.at().bias.value[:, 2], rtol=1e-11)
+    np.testing.assert_allclose(found[:, 0], made.requested.state.q_ref_body[:, 0], atol=1e-11)
+    np.testing.assert_allclose(found[:, 1], made.requested.bias.value[:, 2], rtol=1e-11)
     lines = (folder / "trajectory.tum").read_text("utf-8").splitlines()
     assert sum(not line.startswith("#") for line in lines) == 5
     whole = tables.read_table(folder / "estimate.csv")
@@ -172,7 +181,9 @@ def test_command_line(tmp_path):
     for options, words in (
         (("--every", 0.1, "--at", asked), "got --at and --every"),
         (("--every", 0.1, "--online", "--model", "tight"), "got --online and times"),
-        (("--at", tmp_path / "none.csv"), "no such file"),
+        (("--at", tmp_path / "none.csv"), "expected a CSV file of times"),
+        (("--every", "nan"), "a nanosecond or more"),
+        (("--at", asked, "--at", asked), "once for all or once for each"),
     ):
         result = call("estimate", runs[0], "-o", tmp_path / "bad", *options)
         assert result.exit_code != 0

@@ -26,7 +26,7 @@ from jaxekf.files import check_output
 from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
-from jaxekf.requested import Requested, every, read_requested
+from jaxekf.requested import Every, Requested, every, read_requested
 from jaxekf.result import Estimate
 from jaxekf.robust import Means, robust
 
@@ -97,10 +97,11 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 )
 @click.option(
     "--at",
-    "times_file",
+    "times_files",
+    multiple=True,
     type=click.Path(path_type=Path),
     help="Estimate also at the times of this CSV file's column time, seconds on the recording's clock:"
-    " writes requested.csv, and exports hold these times only.",
+    " writes requested.csv, and exports hold these times only. One for all runs, or repeated for each.",
 )
 @click.option(
     "--every",
@@ -120,7 +121,7 @@ def estimate(
     online: bool,
     smooth: bool,
     exports: tuple[str, ...],
-    times_file: Path | None,
+    times_files: tuple[Path, ...],
     distance: float | None,
     overwrite: bool,
     as_json: bool,
@@ -131,7 +132,7 @@ def estimate(
             "got --online and --smooth, expected one of them: what was known at a time does not know the"
             " whole run; leave one out"
         )
-    requested = _requested(times_file, distance)
+    requested = _requested(times_files, distance, len(runs))
     if online and requested is not None:
         raise click.UsageError(
             "got --online and times to estimate at, expected one of them: what was known is told at the"
@@ -145,8 +146,7 @@ def estimate(
     if online:
         estimates = [estimate_online(recording, chosen, params) for recording in recordings]
     else:
-        at = None if requested is None else [requested] * len(recordings)
-        estimates = estimate_many(recordings, chosen, params, smooth=smooth, at=at)
+        estimates = estimate_many(recordings, chosen, params, smooth=smooth, at=requested)
     summaries = []
     for made, recording in zip(estimates, recordings, strict=True):
         diagnosis = diagnose(made, recording)
@@ -172,15 +172,26 @@ def estimate(
     _print_estimates(f"Estimates by {chosen.name}{known}", summaries)
 
 
-def _requested(times_file: Path | None, distance: float | None) -> Requested | None:
-    """The instants that were asked for by one of two options."""
-    if times_file is not None and distance is not None:
+def _requested(
+    files: tuple[Path, ...], distance: float | None, runs: int
+) -> list[Requested] | Every | None:
+    """The instants that were asked for by one of two options, for each run or all."""
+    if files and distance is not None:
         raise click.UsageError(
             "got --at and --every, expected one of them, since each says which times; leave one out"
         )
-    if times_file is not None:
-        return read_requested(times_file)
-    return None if distance is None else every(distance)
+    if len(files) not in (0, 1, runs):
+        raise click.UsageError(
+            f"got --at {len(files)} times for {runs} runs, expected once for all or once for each; give"
+            " the files in the order of the runs"
+        )
+    if files:
+        times: list[Requested] = [read_requested(file) for file in files]
+        return times * runs if len(times) == 1 else times
+    try:
+        return None if distance is None else every(distance)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error
 
 
 def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:

@@ -88,8 +88,10 @@ class SavedResult:
     @property
     def model(self) -> str:
         """Name of the model, and how it was used."""
-        smoothed = ", smoothed" if self.document["smoothed"] else ""
-        return f"{self.document['model']}{smoothed}"
+        how = ", smoothed" if self.document["smoothed"] else ""
+        # Results of earlier versions do not tell.
+        how += ", as known at each time" if self.document.get("online") else ""
+        return f"{self.document['model']}{how}"
 
     def vector(self, name: str) -> tuple[Floats, Floats] | None:
         """Value and deviation (N, 3) of a part of the state; None where the model has no such part."""

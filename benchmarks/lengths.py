@@ -23,7 +23,7 @@ from rich.progress import Progress  # noqa: E402
 import jaxekf  # noqa: E402
 import tuning  # noqa: E402
 from jaxekf import estimation, padding, simulate  # noqa: E402
-from tuning import fit  # noqa: E402
+from tuning import descent  # noqa: E402
 
 _RATE = simulate.SensorGrade().optical_hz
 """Steps a second: the gyroscope is an input, each tracker sample a step."""
@@ -107,9 +107,9 @@ def main() -> None:
         tuned, spent = timed(
             lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=3)
         )
-        programs = fit._value_and_gradient._cache_size()
+        programs = descent._value_and_gradient._cache_size()
         timed(lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=1))
-        more = fit._value_and_gradient._cache_size() - programs
+        more = descent._value_and_gradient._cache_size() - programs
         done("done")
     of_tuning = {
         "tune: programs": programs,

@@ -210,9 +210,8 @@ def inputs_of(model: Model, params: Parameters, steps: Steps) -> InputSample | N
     """The input of every substep of one run, its clock shifted as the calibration says."""
     if model.input is None or steps.knots is None:
         return None
-    shift = model.input.clock_offset
-    offset = shift(params) if shift is not None else jnp.zeros((), steps.time.dtype)
-    return sample(steps.knots, steps.time, steps.dt, offset)
+    shift = partial(model.input.shift, params)
+    return sample(steps.knots, steps.time, steps.dt, shift)
 
 
 def _innovations(

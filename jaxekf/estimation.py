@@ -63,12 +63,13 @@ def estimate(
 def estimate_many(
     runs: Sequence[Run],
     model: str | Model = "loose",
-    params: Parameters | None = None,
+    params: Parameters | Sequence[Parameters] | None = None,
     *,
     smooth: bool = False,
     at: Sequence[Requested | None] | Every | None = None,
 ) -> list[Estimate]:
-    """Estimate several runs side by side with the same parameters; equal to one call for each.
+    """Estimate several runs side by side, with the same parameters or a list of each run's own; equal to
+    one call for each.
 
     `at` has an entry for each run, or is one grid for all. Raises `ValueError` where it is neither, and
     what `estimate` raises.
@@ -84,13 +85,26 @@ def estimate_many(
     recordings = read(runs)
     chosen = adapted(get_model(model), recordings)
     timelines = timeline.build_many(chosen, recordings, at)
-    used = parameters.as_arrays(chosen.parameters if params is None else params)
-    parameters.check(used)
+    used = _of_each(chosen.parameters if params is None else params, len(runs))
     results = filter_timelines(chosen, used, timelines, smooth=smooth)
     return [
-        _collect(chosen, used, recording, line, *result, smooth=smooth)
-        for recording, line, result in zip(recordings, timelines, results, strict=True)
+        _collect(chosen, own, recording, line, *result, smooth=smooth)
+        for own, recording, line, result in zip(used, recordings, timelines, results, strict=True)
     ]
+
+
+def _of_each(params: Parameters | Sequence[Parameters], runs: int) -> list[Parameters]:
+    """The parameters of each run, checked."""
+    if isinstance(params, Parameters):
+        shared = parameters.as_arrays(params._replace(truth=()))
+        parameters.check(shared)
+        return [shared] * runs
+    if len(params) != runs:
+        raise ValueError(
+            f"got parameters for {len(params)} runs, expected as many as the {runs} runs; pass a set for"
+            " each, or one for all"
+        )
+    return [_of_each(own, 1)[0] for own in params]
 
 
 def read(runs: Sequence[Run]) -> list[Recording]:
@@ -99,9 +113,10 @@ def read(runs: Sequence[Run]) -> list[Recording]:
 
 
 def filter_timelines(
-    model: Model, params: Parameters, lines: Sequence[Timeline], *, smooth: bool = False
+    model: Model, params: Sequence[Parameters], lines: Sequence[Timeline], *, smooth: bool = False
 ) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
-    """Filter runs side by side, and check each; with `smooth` the updated beliefs are the smoothed ones.
+    """Filter runs side by side, each with its parameters, and check each; with `smooth` the updated
+    beliefs are the smoothed ones.
 
     Runs of like length are padded to a common one out of a few, so that few programs are compiled; more
     of them than fit into memory are taken one batch after the other.
@@ -110,7 +125,10 @@ def filter_timelines(
     for members in padding.groups(lines):
         group = [lines[i] for i in members]
         steps = padding.bucketed(group)
-        starts = [(model.initial_mean(lines[i].first), lines[i].setup) for i in members]
+        starts = [
+            (model.initial_mean(lines[i].first), params[i]._replace(setup=lines[i].setup))
+            for i in members
+        ]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         size = min(len(members), _batch(model, steps))
         for start in range(0, len(members), size):
@@ -118,7 +136,7 @@ def filter_timelines(
             index = np.minimum(np.arange(start, start + size), len(members) - 1)
             given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (stacked, steps))
             devices = sharing_devices()
-            found = jax.tree.map(np.asarray, _run(model, devices, smooth, params, *given))
+            found = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
             for place in range(min(size, len(members) - start)):
                 one = jax.tree.map(lambda a, place=place: a[place], found)
                 _check(model, lines[members[start + place]], one[0])
@@ -145,12 +163,10 @@ def _run(
     model: Model,
     devices: tuple[Any, ...],
     smooth: bool,
-    params: Parameters,
-    starts: tuple[Any, Any],
+    starts: tuple[Any, Parameters],
     steps: Steps,
 ) -> Any:
-    means, setup = starts
-    every = parameters.for_runs(params, setup, steps.dt.shape[0])
+    means, every = starts
     cov = jax.vmap(model.initial_covariance)(every)
     given = (model, every, Belief(means, cov), steps)
     if smooth:

@@ -1,5 +1,6 @@
 """The input of a step from a sampled input, differentiable in a clock offset of any size."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -19,17 +20,22 @@ class InputSample(NamedTuple):
     """Hz: a white density ``d`` of the input puts the variance ``d**2 * bandwidth`` on `value`."""
 
 
-def sample(knots: Knots, time: Array, dt: Array, offset: Array) -> InputSample:
-    """The input over each ``[time - dt, time]``, shapes (K, S), its clock shifted by `offset` seconds.
+def sample(
+    knots: Knots, time: Array, dt: Array, shift: Callable[[Array], Array] = jnp.zeros_like
+) -> InputSample:
+    """The input over each ``[time - dt, time]``, shapes (K, S), on its own clock, which is ``shift(time)``
+    seconds ahead.
 
-    The mean is the difference of the running integral at the two ends, which is continuously
-    differentiable in the offset. Beyond the first and last knot the input is held.
+    The mean is the difference of the running integral at the two ends, by the time between them on the
+    input's clock; it is continuously differentiable in the shift. Beyond the first and last knot the input
+    is held.
     """
-    end = time + offset
-    value, integral, bandwidth = _evaluate(knots, end)
-    _, before, _ = _evaluate(knots, end - dt)
+    late, early = shift(time), shift(time - dt)
+    value, integral, bandwidth = _evaluate(knots, time + late)
+    _, before, _ = _evaluate(knots, time - dt + early)
     moving = (dt > 0.0)[..., None]
-    step = jnp.where(moving, dt[..., None], 1.0)
+    # Not the difference of the two ends, whose digits a long run has used up.
+    step = jnp.where(moving, (dt + (late - early))[..., None], 1.0)
     return InputSample(jnp.where(moving, (integral - before) / step, value), value, bandwidth)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 from jax import Array
 
 from jaxekf import manifold
@@ -47,6 +48,9 @@ class Parameters(NamedTuple):
     """Standard deviations of the initial belief."""
     setup: Any = ()
     """What a recording itself tells of its run and nobody tunes: marker geometry, gravity, frames."""
+    truth: Any = ()
+    """How the encoder's clock and frames lie to the tracker's, where a tuner is to find that: no estimate
+    depends on it, only what it is compared with."""
 
 
 class Belief(NamedTuple):
@@ -119,7 +123,18 @@ class Input:
     name: str
     source: Source
     clock_offset: Callable[[Parameters], Array] | None = None
-    """Seconds to add to a time of the timeline to get the input's own clock."""
+    """Seconds to add to a time of the timeline to get the input's own clock, at the start of the run."""
+    clock_drift: Callable[[Parameters], Array] | None = None
+    """Seconds by which that grows in each second of the run."""
+
+    def shift(self, params: Parameters, time: Array) -> Array:
+        """Seconds to add at `time`, seconds since the start of the run."""
+        total = jnp.zeros_like(time)
+        if self.clock_offset is not None:
+            total = total + self.clock_offset(params)
+        if self.clock_drift is not None:
+            total = total + self.clock_drift(params) * time
+        return total
 
 
 @dataclass(frozen=True, eq=False)

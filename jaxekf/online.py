@@ -61,8 +61,8 @@ def outlook(line: Timeline, latency_ns: int, shift_s: float = 0.0) -> Outlook:
     """Where the belief after each epoch of a timeline has to be carried on to.
 
     The belief at time s is known from ``s + latency_ns`` on until the next is; it is told at every sample
-    of the input in between. `shift_s` is the input's clock offset. The input is taken as known up to the
-    instant it is asked at: with a latency shorter than the input's period use `Stream`.
+    of the input in between. `shift_s` is the most that the input's clock is off. The input is taken as
+    known up to the instant it is asked at: with a latency shorter than the input's period use `Stream`.
     """
     if line.steps.knots is None:
         raise ModelError(
@@ -128,8 +128,10 @@ def estimate_online(
         )
     chosen, late = made.model, latency.pop()
     shift = 0.0
-    if chosen.input is not None and chosen.input.clock_offset is not None:
-        shift = float(chosen.input.clock_offset(made.params))
+    if chosen.input is not None:
+        shift = float(
+            jnp.max(jnp.abs(chosen.input.shift(made.params, jnp.asarray(line.steps.time))))
+        )
     view = outlook(line, late, shift)
     at = np.searchsorted(made.time_ns, line.time_ns[:, -1])
     beliefs = Belief(jax.tree.map(lambda a: a[at], made.state), jnp.asarray(made.cov[at]))
@@ -141,6 +143,7 @@ def estimate_online(
         state=belief.mean,
         cov=belief.cov,
         outputs=named_outputs(chosen, outputs),
+        online=True,
         notes=(*made.notes, f"what was known at each time, measurements {late / 1e6:g} ms late"),
     )
 

@@ -64,7 +64,11 @@ def parameters(name):
     if name == "loose":
         matrix = np.eye(3) + 0.05 * np.random.default_rng(8).standard_normal((3, 3))
         noise = loose.Noise(gyroscope, walk, optical)
-        calibration, initial = loose.Calibration(matrix, 0.0031), loose.Initial(0.1, 0.02)
+        turn = np.array([0.02, -0.03, 0.01])
+        calibration, initial = (
+            loose.Calibration(matrix, 0.0031, turn, 0.01),
+            loose.Initial(0.1, 0.02),
+        )
     elif name == "loose_rate":
         noise = loose_rate.Noise(acceleration, gyroscope, walk, optical)
         calibration, initial = loose_rate.Calibration(), loose_rate.Initial(0.1, 0.2, 0.02)

@@ -105,7 +105,7 @@ def input_at(model, steps, k=1, s=-1):
         return None
     time, dt = jnp.asarray(steps.time), jnp.asarray(steps.dt)
     knots = jax.tree.map(jnp.asarray, steps.knots)
-    inputs = interpolation.sample(knots, time, dt, jnp.zeros(()))
+    inputs = interpolation.sample(knots, time, dt)
     return jax.tree.map(lambda a: a[k, s], inputs)
 
 

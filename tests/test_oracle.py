@@ -8,6 +8,7 @@ import pytest
 import scenario
 import toy_models
 from filterpy.kalman import KalmanFilter
+from scipy.spatial.transform import Rotation
 
 from jaxekf import linearise
 from jaxekf.interpolation import InputSample
@@ -23,7 +24,9 @@ def system_of(name):
     params = scenario.parameters(name)
     cov = {key: np.asarray(leaf @ leaf.T) for key, leaf in params.noise._asdict().items()}
     if name == "loose":
-        matrix = np.asarray(params.calibration.gyroscope_matrix)
+        calibration = params.calibration
+        turn = Rotation.from_rotvec(calibration.alignment).as_matrix()
+        matrix = turn @ np.asarray(calibration.gyroscope_matrix)
         return params, oracle.Loose(**cov, gyroscope_matrix=matrix)
     system = oracle.LooseRate if name == "loose_rate" else oracle.LooseAdditive
     return params, system(**cov)
@@ -45,15 +48,15 @@ def row_masks(run, name):
     return mask
 
 
-def events_of(run, name, mask, offset):
+def events_of(run, name, mask, offset, drift):
     since = scenario.since_last(run)
     events = []
     for i, dt in enumerate(np.diff(run.time, prepend=0.0)):
         samples = {"optical": (run.optical[i], mask[i], since[i])}
         u = None
         if name == "loose":
-            end = run.time[i] + offset
-            u = oracle.interval_mean(run.knots.time, run.knots.value, end - dt, end)
+            ends = (1.0 + drift) * np.array([run.time[i] - dt, run.time[i]]) + offset
+            u = oracle.interval_mean(run.knots.time, run.knots.value, *ends)
         else:
             samples["gyroscope"] = (run.gyroscope[i], run.gyroscope_seen[i], since[i])
         events.append((dt, u, samples))
@@ -68,8 +71,10 @@ def prepared(name, seed):
     mean, cov = start_of(name, run, model.error_dim)
     belief = scenario.as_arrays(Belief(type(model.space)(*mean), cov))
     mask = row_masks(run, name)
-    offset = float(params.calibration.clock_offset) if name == "loose" else 0.0
-    expected = oracle.run(system, mean, cov, events_of(run, name, mask, offset))
+    clock = (0.0, 0.0)
+    if name == "loose":
+        clock = (float(params.calibration.clock_offset), float(params.calibration.clock_drift))
+    expected = oracle.run(system, mean, cov, events_of(run, name, mask, *clock))
     return run, model, params, belief, mask, expected
 
 

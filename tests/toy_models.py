@@ -418,9 +418,7 @@ def toy_run(model, params, seed, rest=False):
     inputs = None
     if steps.knots is not None:
         knots = jax.tree.map(jnp.asarray, steps.knots)
-        inputs = interpolation.sample(
-            knots, jnp.asarray(steps.time), jnp.asarray(steps.dt), jnp.zeros(())
-        )
+        inputs = interpolation.sample(knots, jnp.asarray(steps.time), jnp.asarray(steps.dt))
     transition, draws = _steppers(model)
     values = {name: [] for name in draws}
     for k in range(EPOCHS):

@@ -1,8 +1,11 @@
 """Noise covariances, and calibration, tuned by gradient against encoder truth or by likelihood."""
 
 from tuning.data import Data, prepare
-from tuning.fit import Iteration, Tuned, tune
-from tuning.noise import Layout, layout, scaled, with_axes
+from tuning.descent import Iteration
+from tuning.fit import Tuned, fit_runs, tune
+from tuning.frame import TruthFrame
+from tuning.information import Information
+from tuning.noise import Free, Layout, layout, scaled, with_axes
 from tuning.objectives import (
     Objective,
     attitude_error,
@@ -10,24 +13,30 @@ from tuning.objectives import (
     innovation_likelihood,
     rate_error,
 )
+from tuning.spec import read_free
 from tuning.validation import Comparison, Row, compare, mean_by_variant
 
 __all__ = [
     "Comparison",
     "Data",
+    "Free",
+    "Information",
     "Iteration",
     "Layout",
     "Objective",
     "Row",
+    "TruthFrame",
     "Tuned",
     "attitude_error",
     "compare",
     "evaluate",
+    "fit_runs",
     "innovation_likelihood",
     "layout",
     "mean_by_variant",
     "prepare",
     "rate_error",
+    "read_free",
     "scaled",
     "tune",
     "with_axes",

@@ -6,42 +6,37 @@ from functools import partial
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf import parameters
 from jaxekf.errors import TuningError
-from jaxekf.estimation import evaluate_outputs
 from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
-from tuning.objectives import output_error, run_batch
+from tuning.noise import Layout
+from tuning.objectives import error_and_covariance, run_batch
 
 
 @partial(jit, static_argnums=0)
-def _nees(model: Model, params: Parameters, data: Data) -> tuple[Array, Array]:
+def _nees(model: Model, every: Parameters, data: Data) -> tuple[Array, Array]:
     """Sum of normalised squared attitude errors over all judged instants, and of degrees of freedom."""
-    output = run_batch(model, params, data, "estimates")
-    runs = data.steps.dt.shape[0]
-    every = parameters.for_runs(params, data.setup, runs)
-    error = output_error(model, params, output, data, "attitude")
-    _, cov = evaluate_outputs(model, every, output)["attitude"]
+    output = run_batch(model, every, data, "estimates")
+    error, cov = error_and_covariance(model, every, output, data)
     judged = data.truth["attitude"].judged
-    eye = jnp.eye(cov.shape[-1])
-    safe = jnp.where(judged[..., None, None], cov, jnp.broadcast_to(eye, cov.shape))
-    solved = jnp.linalg.solve(safe, error[..., None])[..., 0]
+    solved = jnp.linalg.solve(cov, error[..., None])[..., 0]
     squared = jnp.where(judged, jnp.sum(error * solved, axis=-1), 0.0)
     return jnp.sum(squared), error.shape[-1] * jnp.sum(judged)
 
 
-def scale(model: Model, params: Parameters, groups: Sequence[Data]) -> float:
+def scale(model: Model, params: Parameters, groups: Sequence[Data], where: Layout) -> float:
     """The factor for Q, R and P0 at which the attitude errors match their covariances on average.
 
-    Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set).
+    Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set). `where` says
+    what each run has of its own.
     """
     if not any("attitude" in d.truth and bool(jnp.any(d.truth["attitude"].judged)) for d in groups):
         raise TuningError(
             "got no scored encoder sample, expected some to compare covariances with; tune by"
             " likelihood without rescaling"
         )
-    found = [_nees(model, params, data) for data in groups]
+    found = [_nees(model, where.of_runs(params, d.setup, d.place), d) for d in groups]
     factor = float(sum(squared for squared, _ in found) / sum(freedom for _, freedom in found))
     if not 0.0 < factor < float("inf"):
         raise TuningError(

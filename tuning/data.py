@@ -1,6 +1,6 @@
 """Runs with truth as arrays that stay on the device while the tuner works."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,9 +11,11 @@ from jaxekf import padding, timeline
 from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, read
 from jaxekf.model import Model
-from jaxekf.recording import Recording
+from jaxekf.recording import NANOSECONDS, Encoder, Floats, Recording, Times
 from jaxekf.timeline import Steps, Timeline
-from jaxekf.truth import encoder_at, encoder_rate_at
+from jaxekf.truth import encoder_at, encoder_rate_at, encoder_velocity_at
+
+_SLOPE_NS = 10_000_000
 
 
 class Truth(NamedTuple):
@@ -23,6 +25,10 @@ class Truth(NamedTuple):
     """(runs, K, S, ...) in the output's space."""
     judged: Any
     """(runs, K, S)."""
+    first: Any
+    """(runs, K, S, 3) derivative by time; of an attitude its body rate."""
+    second: Any
+    """(runs, K, S, 3) derivative of that."""
 
 
 class Data(NamedTuple):
@@ -36,6 +42,8 @@ class Data(NamedTuple):
     truth: dict[str, Truth]
     counted: Any
     """(runs, K, S) instants past the burn-in, at which the likelihood counts."""
+    place: Any
+    """(runs,) place of each run among all that were given."""
 
 
 def prepare(
@@ -46,7 +54,7 @@ def prepare(
     Raises `TuningError` without any run or where truth is needed and none is scored.
     """
     recordings, lines = _read(model, runs)
-    data = _stack(model, recordings, lines, burn_in_s)
+    data = _stack(model, recordings, lines, burn_in_s, range(len(lines)))
     _check([data], recordings, burn_in_s, need_truth)
     return data
 
@@ -59,7 +67,7 @@ def prepare_groups(
     found = []
     for members in padding.groups(lines):
         chosen = [recordings[i] for i in members], [lines[i] for i in members]
-        found.append(_stack(model, *chosen, burn_in_s))
+        found.append(_stack(model, *chosen, burn_in_s, members))
     _check(found, recordings, burn_in_s, need_truth)
     return tuple(found)
 
@@ -86,26 +94,38 @@ def _check(
 
 
 def _stack(
-    model: Model, recordings: Sequence[Recording], lines: Sequence[Timeline], burn_in_s: float
+    model: Model,
+    recordings: Sequence[Recording],
+    lines: Sequence[Timeline],
+    burn_in_s: float,
+    place: Sequence[int],
 ) -> Data:
     steps = padding.bucketed(lines)
     starts = [(model.initial_mean(line.first), line.setup) for line in lines]
     shape = steps.dt.shape
     names = [out.name for out in model.outputs if out.name in ("attitude", "rate", "position")]
-    truth = {name: Truth(_blank(name, shape), np.zeros(shape, bool)) for name in names}
+    truth = {
+        name: Truth(
+            _blank(name, shape), np.zeros(shape, bool), np.zeros((*shape, 3)), np.zeros((*shape, 3))
+        )
+        for name in names
+    }
     counted = np.zeros(shape, bool)
     for i, (recording, line) in enumerate(zip(recordings, lines, strict=True)):
-        place = np.s_[i, : line.time_ns.shape[0], shape[2] - line.time_ns.shape[1] :]
+        at = np.s_[i, : line.time_ns.shape[0], shape[2] - line.time_ns.shape[1] :]
         settled = (np.asarray(line.steps.time) >= burn_in_s) & line.valid
-        counted[place] = settled
+        counted[at] = settled
         if recording.encoder is None:
             continue
-        for name, (value, known) in _truth(recording, line).items():
+        for name, known in _truth(recording, line).items():
             if name in truth:
-                truth[name].value[place] = value
-                truth[name].judged[place] = known & settled
+                truth[name].value[at] = known.value
+                truth[name].judged[at] = known.judged & settled
+                truth[name].first[at] = known.first
+                truth[name].second[at] = known.second
     means, setup = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
-    return jax.tree.map(jnp.asarray, Data(means, setup, steps, truth, counted))
+    found = Data(means, setup, steps, truth, counted, np.array(place))
+    return jax.tree.map(jnp.asarray, found)
 
 
 def _blank(name: str, shape: tuple[int, ...]) -> Any:
@@ -117,20 +137,37 @@ def _blank(name: str, shape: tuple[int, ...]) -> Any:
     return blank
 
 
-def _truth(recording: Recording, line: Timeline) -> dict[str, tuple[Any, Any]]:
+def _truth(recording: Recording, line: Timeline) -> dict[str, Truth]:
     """What the encoder knows at every instant of a timeline, and where: attitude, rate, position."""
     flat = line.time_ns.reshape(-1)
     encoder = recording.need_encoder()
     at = encoder_at(encoder, flat)
     rate = encoder_rate_at(encoder, flat)
     known = np.isfinite(rate).all(axis=1) & at.scored
+    jerk = _slope(encoder, flat, encoder_rate_at)
     shape = line.time_ns.shape
+
+    def laid(values: Any) -> Any:
+        return np.nan_to_num(values).reshape(*shape, values.shape[1])
+
     found = {
-        "attitude": (at.q_ref_body.reshape(*shape, 4), at.scored.reshape(shape)),
-        "rate": (np.where(known[:, None], rate, 0.0).reshape(*shape, 3), known.reshape(shape)),
+        "attitude": Truth(laid(at.q_ref_body), at.scored.reshape(shape), laid(rate), laid(jerk)),
+        # Further derivatives would be mostly noise.
+        "rate": Truth(laid(rate), known.reshape(shape), laid(jerk), np.zeros((*shape, 3))),
     }
     if at.position is not None:
         there = np.isfinite(at.position).all(axis=1) & at.scored
-        position = np.where(there[:, None], at.position, 0.0).reshape(*shape, 3)
-        found["position"] = (position, there.reshape(shape))
+        speed = encoder_velocity_at(encoder, flat)
+        found["position"] = Truth(
+            laid(at.position),
+            there.reshape(shape),
+            laid(speed),
+            laid(_slope(encoder, flat, encoder_velocity_at)),
+        )
     return found
+
+
+def _slope(encoder: Encoder, time_ns: Times, of: Callable[[Encoder, Times], Floats]) -> Floats:
+    """Derivative (N, 3) of what an encoder tells at any time, by central differences."""
+    half = _SLOPE_NS
+    return (of(encoder, time_ns + half) - of(encoder, time_ns - half)) / (2 * half / NANOSECONDS)

@@ -1,49 +1,34 @@
 """The tuner: gradient steps over all training runs at once, judged on runs it does not learn from."""
 
 import datetime
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax import Array
 
 from jaxekf import parameters
 from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, provenance, read, require_float64
-from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.parameters import as_arrays
-from jaxekf.recording import Recording
-from tuning import consistency
+from jaxekf.recording import Flags, Floats, Recording
+from tuning import consistency, resume
 from tuning.data import Data, prepare_groups
-from tuning.noise import Layout, layout, scaled, with_axes
-from tuning.objectives import Objective, attitude_error, count, evaluate, parse, weights_of
+from tuning.descent import Descent, Iteration, Progress, own_step
+from tuning.frame import TruthFrame, no_correction
+from tuning.information import Information, information, interval, what_would_tell
+from tuning.noise import Free, Layout, layout, scaled, with_axes
+from tuning.objectives import Objective, attitude_error, parse
 
-_MOST_REJECTIONS = 10
-_IMPROVEMENT = 1e-4
-_SMALL_GAIN = 1e-5
-_LONGEST_STEP = 1.0
-
-
-class Iteration(NamedTuple):
-    """One step of the tuner."""
-
-    number: int
-    training: float
-    validation: float
-    """NaN without validation runs."""
-    rejected: bool
-    """The objective or its gradient was not finite; the step was shortened."""
-
-
-Progress = Callable[[Iteration, int], None]
+_ROUNDS = 2
+"""Times that the search goes on after something was found to be open and was fixed at its start."""
+_OWN_FIT = 8
 
 
 @dataclass(frozen=True)
@@ -52,7 +37,7 @@ class Tuned:
 
     model: Model
     params: Parameters
-    """The best parameters, by validation where there is one."""
+    """The best parameters, by validation where there is one; of what each run has of its own the mean."""
     start: Parameters
     objective: Objective
     best: Iteration
@@ -63,31 +48,69 @@ class Tuned:
     """Factor by which all covariances were scaled after the fit so that errors match them."""
     layout: Layout
     origin: dict[str, Any] = field(default_factory=dict)
+    each: dict[str, Parameters] = field(default_factory=dict)
+    """Where runs have parameters of their own: those of each training run, by its name."""
+    truth: TruthFrame | None = None
+    """How the encoders lie to the tracker, where that was free."""
+    free: Floats = field(default_factory=lambda: np.zeros(0))
+    """(n,) the best free vector, before the scale."""
+    information: Information | None = None
+    """What the measurements tell of each number, at the best; None where it was not asked for."""
+    fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
+    """(n,) numbers that the data leave open and that stayed at their start."""
+    evaluations: int = 0
+    """Of the objective with its gradient."""
 
     @property
     def rejections(self) -> int:
         """Steps that were rejected because they were not finite."""
         return sum(step.rejected for step in self.history)
 
+    @cached_property
+    def intervals(self) -> dict[str, tuple[float, float, float]]:
+        """Value and 95 % interval (Laplace's, by innovations and prior) of each free number that the data
+        determine, by its label, in its unit; before the scale."""
+        if self.information is None:
+            return {}
+        sigma = self.information.sigma(self.fixed)
+        told = zip(
+            self.layout.labels(), interval(self.layout, self.free, sigma), self.fixed, strict=True
+        )
+        return {label: ends for label, ends, fixed in told if not fixed}
+
+    @property
+    def open(self) -> dict[str, str]:
+        """What the data leave open, by label, and what recordings would tell it."""
+        labels = self.layout.labels()
+        found = [labels[i] for i in np.flatnonzero(self.fixed)]
+        return {label: what_would_tell(label.split("[")[0].split(" of run")[0]) for label in found}
+
+    @property
+    def moved(self) -> list[str]:
+        """How far each free number moved from its start, in words: the factor of a logarithm, else in
+        deviations of its prior."""
+        start = np.asarray(self.layout.to_free(self.start))
+        off, told, at = self.free - start, [], 0
+        for leaf in self.layout.leaves:
+            for i in range(leaf.size):
+                change = float(off[at + i])
+                if leaf.is_logarithm(i):
+                    told.append(f"x {np.exp(change):.3g}")
+                else:
+                    told.append(f"{change / leaf.prior:+.2g} prior sigma")
+            at += leaf.size
+        return told
+
+    def of_run(self, run: Run) -> Parameters:
+        """The parameters of a training run, its own included."""
+        return self.each.get(_name(run), self.params)
+
     def save(self, folder: Path | str) -> None:
-        """Write `noise.toml` and `calibration.toml`, with units and where they came from."""
+        """Write `noise.toml` and `calibration.toml`, with units and where they came from; where runs have
+        parameters of their own also ``runs/NAME`` with the same files for each."""
         parameters.save(folder, self.model, self.params, self.origin)
-
-
-def _objective_value(
-    model: Model,
-    objective: Objective,
-    where: Layout,
-    free: Array,
-    base: Parameters,
-    data: Data,
-    counts: dict[str, Array],
-) -> Array:
-    return evaluate(model, objective, where.from_free(free, base), data, counts)
-
-
-_value = jit(_objective_value, static_argnums=(0, 1, 2))
-_value_and_gradient = jit(jax.value_and_grad(_objective_value, 3), static_argnums=(0, 1, 2))
+        for name, params in self.each.items():
+            parameters.save(Path(folder) / "runs" / name, self.model, params, self.origin)
 
 
 def tune(
@@ -96,27 +119,40 @@ def tune(
     validate: Sequence[Run] = (),
     model: str | Model = "loose",
     objective: Objective | str | None = None,
-    free: Sequence[str] | None = None,
+    free: Sequence[str | Free] | None = None,
     start: Parameters | None = None,
     axes: str | None = None,
     iterations: int = 60,
     patience: int = 15,
     burn_in_s: float = 0.0,
     rescale: bool | None = None,
+    smooth: bool = False,
+    judge: bool = False,
     optimiser: optax.GradientTransformation | None = None,
+    checkpoint: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Tuned:
     """Tune noise, and calibration where asked, by gradient over all runs in one compiled call.
 
-    `objective` is the attitude error unless given. `free` names what may change (default: all noise);
-    `axes` gives what is free one deviation for all axes (`tied`), one for `each`, or a `full` matrix;
-    None leaves it as the start has it. L-BFGS is the optimiser unless an optax one is given. The best
-    parameters so far are kept, by the validation runs where there are any; the tuner stops when they
-    have not improved for `patience` iterations. Steps that are not finite are rejected, shortened and
-    counted. Ctrl-C ends the search and keeps the best so far.
+    `objective` is the attitude error unless given. `free` names what may change (default: all noise); a
+    `Free` says more: a prior, bounds, and whether each run has its own. ``truth`` frees the encoder's
+    clock and frames (`TruthFrame`). `axes` gives what is free one deviation for all axes (`tied`), one for
+    `each`, or a `full` matrix; None leaves it as the start has it. With `smooth` errors are those of the
+    smoothed estimate. L-BFGS is the optimiser unless an optax one is given.
 
-    The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when the
-    likelihood is not in the objective) they are scaled afterwards so that the training errors match
+    The best parameters so far are kept, by the validation runs where there are any; what these have of
+    their own is found from their innovations, never from their truth. The tuner stops when they have not
+    improved for `patience` iterations. Steps that are not finite are rejected, shortened and counted.
+    Ctrl-C ends the search and keeps the best so far.
+
+    With `judge` the Fisher information of the innovations is taken at the best: numbers that the data leave
+    open go back to their start, the search goes on without them, and the others have intervals.
+
+    With a `checkpoint` (a file) a tuning that was stopped, however, goes on from its last iteration when it
+    is called again with the same arguments; the file is gone when it has ended.
+
+    The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when no
+    likelihood is in the objective) they are scaled afterwards so that the training errors match
     their covariances.
 
     Raises `TuningError` where the problem is ill-posed, and what `estimate` raises for bad data.
@@ -125,55 +161,116 @@ def tune(
     learnt, judging = read(runs), read(validate)
     chosen = adapted(get_model(model), [*learnt, *judging])
     aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
+    aim = replace(aim, smoothed=smooth or aim.smoothed)
     base = as_arrays(chosen.parameters if start is None else start)
+    if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
+        base = base._replace(truth=no_correction())
     if axes is not None:
         base = with_axes(chosen, base, axes, free)
-    where = layout(chosen, base, free)
+    where = layout(chosen, base, free, len(learnt))
     _check_runs(runs, validate)
-    need_truth = bool(aim.errors)
-    training = prepare_groups(chosen, learnt, burn_in_s=burn_in_s, need_truth=need_truth)
-    held_out = None
-    if validate:
-        held_out = prepare_groups(chosen, judging, burn_in_s=burn_in_s, need_truth=need_truth)
-    search = _Search(chosen, aim, where, base, training, held_out)
-    best_free, best, history, stopped = search.run(optimiser, iterations, patience, progress)
-    params = where.from_free(best_free, base)
+    options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
+    training = prepare_groups(chosen, learnt, **options)
+    held_out = prepare_groups(chosen, judging, **options) if validate else None
+    search = Descent(chosen, aim, where, base, training, held_out, iterations, optimiser)
+    if checkpoint is not None:
+        asked = (_names(runs), _names(validate), iterations, patience, burn_in_s, judge)
+        resume.attach(search, Path(checkpoint), repr(asked))
+    known, stopped = _search(search, patience, judge, progress)
+    assert search.best is not None
+    params = where.from_free(search.best.free, base)
     scale = 1.0
-    if rescale if rescale is not None else not aim.likelihood and "attitude" in training[0].truth:
-        scale = consistency.scale(chosen, params, training)
+    likely = aim.likelihood or aim.truth
+    if rescale if rescale is not None else not likely and "attitude" in training[0].truth:
+        scale = consistency.scale(chosen, params, training, where)
         params = scaled(params, scale)
+    if checkpoint is not None:
+        Path(checkpoint).unlink(missing_ok=True)
+    names = _names(runs)
+    each = {name: where.one_run(params, i) for i, name in enumerate(names)} if where.own else {}
+    best = search.best.step
     origin = {
-        "runs": [_name(run) for run in runs],
-        "validation_runs": [_name(run) for run in validate],
+        "runs": names,
+        "validation_runs": _names(validate),
         "objective": aim.describe(),
         "free": [leaf.name for leaf in where.leaves],
-        "iterations": len(history),
+        "iterations": len(search.history),
         "best_iteration": best.number,
         "training_value": best.training,
         "covariance_scale": scale,
         "date": datetime.date.today().isoformat(),
         **provenance(),
     }
+    if where.own:
+        origin["own_of_each_run"] = sorted(where.own)
+    if search.fixed.any():
+        origin["left_open"] = [where.labels()[i] for i in np.flatnonzero(search.fixed)]
     if validate:
         origin["validation_value"] = best.validation
-    return Tuned(chosen, params, base, aim, best, tuple(history), stopped, scale, where, origin)
+    return Tuned(
+        chosen,
+        where.together(params)._replace(truth=()),
+        base,
+        aim,
+        best,
+        tuple(search.history),
+        stopped,
+        scale,
+        where,
+        origin,
+        {name: own._replace(truth=()) for name, own in each.items()},
+        params.truth or None,
+        np.asarray(search.best.free),
+        known,
+        search.fixed,
+        search.evaluations,
+    )
 
 
-def on_host(free: Array) -> Any:
-    """The vector without its place: a gradient comes back shared among the devices, and a point found
-    from it would be another argument to compile for."""
-    return np.asarray(free)
+def _search(
+    search: Descent, patience: int, judge: bool, progress: Progress | None
+) -> tuple[Information | None, str]:
+    """Search, fix what the data leave open, and search on; what is known at the end."""
+    while True:
+        stopped = search.run(patience, progress)
+        if not judge:
+            return None, stopped
+        assert search.best is not None
+        known = information(
+            search.model, search.layout, search.best.free, search.base, search.training
+        )
+        fixed = known.open(search.fixed)
+        interrupted = "interrupted" in stopped
+        if (fixed == search.fixed).all() or search.rounds >= _ROUNDS or interrupted:
+            return known, stopped
+        search.again(fixed)
 
 
-def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Array]:
-    """What each term of the objective is the mean over, of all groups together."""
-    found = [count(data, tuple(weights_of(objective))) for data in groups]
-    return {name: sum((f[name] for f in found), jnp.zeros((), int)) for name in found[0]}
+def fit_runs(runs: Sequence[Run], tuned: Tuned, *, burn_in_s: float = 0.0) -> dict[str, Parameters]:
+    """Parameters of runs that were not learnt from, by name: what each has of its own is found from its own
+    innovations, with the prior about the mean of the training runs; its truth is not looked at.
+
+    Where runs have nothing of their own these are `Tuned.params` for each.
+    """
+    recordings = read(runs)
+    names = _names(recordings)
+    where = tuned.layout.only(tuned.layout.own).for_runs_number(len(recordings))
+    if not where.leaves:
+        return dict.fromkeys(names, tuned.params)
+    groups: tuple[Data, ...] = prepare_groups(
+        tuned.model, recordings, burn_in_s=burn_in_s, need_truth=False
+    )
+    centre = np.asarray(where.to_free(tuned.params))
+    found = centre
+    for _ in range(_OWN_FIT):
+        found = own_step(tuned.model, where, found, centre, tuned.params, groups)
+    params = where.from_free(jnp.asarray(found), tuned.params)
+    return {name: where.one_run(params, i) for i, name in enumerate(names)}
 
 
 def _check_runs(runs: Sequence[Run], validate: Sequence[Run]) -> None:
     """A run that is learnt from cannot judge what was learnt."""
-    both = sorted({_name(run) for run in runs} & {_name(run) for run in validate})
+    both = sorted(set(_names(runs)) & set(_names(validate)))
     if both:
         raise TuningError(
             f"got {both} among the training and the validation runs, expected different runs;"
@@ -181,161 +278,9 @@ def _check_runs(runs: Sequence[Run], validate: Sequence[Run]) -> None:
         )
 
 
+def _names(runs: Sequence[Run]) -> list[str]:
+    return [_name(run) for run in runs]
+
+
 def _name(run: Run) -> str:
     return run.name if isinstance(run, Recording) else Path(run).name
-
-
-@dataclass
-class _Search:
-    """The optimiser's loop and what it works on."""
-
-    model: Model
-    objective: Objective
-    layout: Layout
-    base: Parameters
-    training: tuple[Data, ...]
-    validation: tuple[Data, ...] | None
-    found: tuple[Array, Iteration, list[Iteration]] | None = None
-    """The best so far, for an interrupted search."""
-
-    @cached_property
-    def training_counts(self) -> dict[str, Array]:
-        """What the terms are the means over."""
-        return total_counts(self.training, self.objective)
-
-    @cached_property
-    def validation_counts(self) -> dict[str, Array]:
-        """The same of the validation runs."""
-        return total_counts(self.validation or (), self.objective)
-
-    def value_and_gradient(self, free: Array) -> tuple[float, Array]:
-        counts, plain = self.training_counts, on_host(free)
-        found = [
-            _value_and_gradient(
-                self.model, self.objective, self.layout, plain, self.base, data, counts
-            )
-            for data in self.training
-        ]
-        gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(free.shape))
-        return float(sum(value for value, _ in found)), jnp.asarray(gradient)
-
-    def validation_value(self, free: Array) -> float:
-        if self.validation is None:
-            return float("nan")
-        counts, plain = self.validation_counts, on_host(free)
-        return float(
-            sum(
-                _value(self.model, self.objective, self.layout, plain, self.base, data, counts)
-                for data in self.validation
-            )
-        )
-
-    def run(
-        self,
-        optimiser: optax.GradientTransformation | None,
-        iterations: int,
-        patience: int,
-        progress: Progress | None,
-    ) -> tuple[Array, Iteration, list[Iteration], str]:
-        """Step until done; the best free vector, its iteration, the history and why it stopped."""
-        try:
-            return self._step(optimiser, iterations, patience, progress)
-        except KeyboardInterrupt:
-            if self.found is None:
-                raise
-            return *self.found, "interrupted; the best so far is kept"
-
-    def _step(
-        self,
-        optimiser: optax.GradientTransformation | None,
-        iterations: int,
-        patience: int,
-        progress: Progress | None,
-    ) -> tuple[Array, Iteration, list[Iteration], str]:
-        walk = _Walk(self.layout.to_free(self.base), optimiser)
-        history: list[Iteration] = []
-        best_judged, since = float("inf"), 0
-        stopped = f"the {iterations} iterations asked for are done"
-        for number in range(iterations):
-            value, gradient = self.value_and_gradient(walk.candidate)
-            finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
-            held = self.validation_value(walk.candidate) if finite else float("nan")
-            step = Iteration(number, value, held, not finite)
-            history.append(step)
-            if progress is not None:
-                progress(step, iterations)
-            judged = value if self.validation is None else held
-            if finite and judged < best_judged:
-                if judged < best_judged - _IMPROVEMENT * abs(judged):
-                    since = number
-                best_judged = judged
-                self.found = (walk.candidate, step, history)
-            if self.found is None:
-                raise TuningError(
-                    f"got an objective of {judged} or a gradient that is not finite at the start,"
-                    " expected finite ones; start from other noise or check the data"
-                )
-            if number - since >= patience:
-                stopped = f"no improvement in {patience} iterations"
-                break
-            if reason := walk.move(value, gradient, finite):
-                stopped = reason
-                break
-        if self.found is None:
-            raise TuningError(f"got {iterations} iterations, expected at least one; ask for more")
-        return *self.found, stopped
-
-
-class _Walk:
-    """Where the optimiser stands and where it looks next.
-
-    The default is L-BFGS with backtracking: the direction is optax's, a step is halved until the
-    objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). An
-    optax optimiser of the caller's own is followed as it is, but for steps that are not finite.
-    """
-
-    def __init__(self, free: Array, optimiser: optax.GradientTransformation | None) -> None:
-        self.monotone = optimiser is None
-        self.optimiser = optimiser or optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
-        self.state = self.optimiser.init(free)
-        self.candidate = self.stand = free
-        self.value = float("inf")
-        self.gradient = self.change = jnp.zeros_like(free)
-        self.rejections = self.small_gains = 0
-
-    def move(self, value: float, gradient: Array, finite: bool) -> str:
-        """Take or refuse the candidate and choose the next; a reason to stop, or nothing."""
-        if not finite or (self.monotone and not self._falls(value)):
-            self.rejections += 1
-            if self.rejections >= _MOST_REJECTIONS:
-                return (
-                    "no step along the gradient lowers the objective any more"
-                    if finite
-                    else f"{_MOST_REJECTIONS} steps in a row failed"
-                )
-            self.change = (0.5 if finite else 0.25) * self.change
-            self.candidate = self.stand + self.change
-            return ""
-        small = self.value - value < _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
-        self.small_gains = self.small_gains + 1 if small and self.monotone else 0
-        if self.small_gains >= 2:
-            return "converged"
-        self.rejections = 0
-        self.stand, self.value, self.gradient = self.candidate, value, gradient
-        update, self.state = self.optimiser.update(gradient, self.state, self.stand)
-        self.change = jnp.asarray(update)
-        if self.monotone:
-            if float(self.change @ gradient) >= 0.0:
-                self.change = -gradient
-            longest = float(jnp.max(jnp.abs(self.change)))
-            if longest == 0.0:
-                return "converged"
-            self.change = self.change * min(1.0, _LONGEST_STEP / longest)
-        self.candidate = self.stand + self.change
-        return ""
-
-    def _falls(self, value: float) -> bool:
-        """Armijo's condition of sufficient decrease."""
-        if not np.isfinite(self.value):
-            return True
-        return value <= self.value + 1e-4 * float(self.change @ self.gradient)

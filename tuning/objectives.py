@@ -11,9 +11,11 @@ from jax import Array
 
 from jaxekf import ekf, manifold, parameters
 from jaxekf.errors import TuningError
-from jaxekf.estimation import sharing_devices
+from jaxekf.estimation import evaluate_outputs, sharing_devices
 from jaxekf.model import Belief, Model, Parameters
+from jaxekf.smoother import run_smoother_batch
 from tuning.data import Data
+from tuning.frame import TruthFrame, corrected
 
 _DEGREES_SQUARED = float(np.rad2deg(1.0) ** 2)
 
@@ -22,16 +24,26 @@ _DEGREES_SQUARED = float(np.rad2deg(1.0) ** 2)
 class Objective:
     """A weighted sum of mean squared errors against truth and of innovation likelihood.
 
-    ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``; attitude
+    ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``, and the
+    likelihood of the truth and a prior where they have a weight; attitude
     errors are geodesic angles in degrees, rate errors in deg/s, position errors in mm. Add two objectives
     to combine them.
     """
 
     errors: tuple[tuple[str, float], ...] = ()
     likelihood: float = 0.0
+    """Weight of the innovation likelihood."""
+    truth: float = 0.0
+    """Weight of the likelihood of the true attitude under the estimate."""
+    prior: float = 0.0
+    """Weight of the prior (see `Free.prior`), which counts as so many more rows: 1 with a likelihood of 1
+    gives the most probable parameters."""
+    smoothed: bool = False
+    """Whether errors are those of the smoothed estimate."""
 
     def __post_init__(self) -> None:
-        weights = [weight for _, weight in self.errors] + [self.likelihood]
+        weights = [weight for _, weight in self.errors]
+        weights += [self.likelihood, self.truth, self.prior]
         if not all(0.0 <= weight < float("inf") for weight in weights):
             raise TuningError(
                 f"got the weights {weights}, expected numbers of at least 0; an objective is"
@@ -39,11 +51,23 @@ class Objective:
             )
 
     def __add__(self, other: "Objective") -> "Objective":
-        return Objective(self.errors + other.errors, self.likelihood + other.likelihood)
+        return Objective(
+            self.errors + other.errors,
+            self.likelihood + other.likelihood,
+            self.truth + other.truth,
+            self.prior + other.prior,
+            self.smoothed or other.smoothed,
+        )
 
     def __mul__(self, factor: float) -> "Objective":
         scaled = tuple((name, weight * factor) for name, weight in self.errors)
-        return Objective(scaled, self.likelihood * factor)
+        return Objective(
+            scaled,
+            self.likelihood * factor,
+            self.truth * factor,
+            self.prior * factor,
+            self.smoothed,
+        )
 
     __rmul__ = __mul__
 
@@ -52,7 +76,16 @@ class Objective:
         terms = [f"{weight:g} * mean squared {name} error" for name, weight in self.errors]
         if self.likelihood:
             terms.append(f"{self.likelihood:g} * negative innovation log-likelihood")
-        return " + ".join(terms)
+        if self.truth:
+            terms.append(f"{self.truth:g} * negative log-likelihood of the true attitude")
+        if self.prior:
+            terms.append(f"{self.prior:g} * prior")
+        return " + ".join(terms) + (", smoothed" if self.smoothed else "")
+
+    @property
+    def needs_truth(self) -> bool:
+        """Whether an encoder is needed."""
+        return bool(self.errors) or self.truth > 0.0
 
 
 def attitude_error() -> Objective:
@@ -75,11 +108,29 @@ def innovation_likelihood() -> Objective:
     return Objective(likelihood=1.0)
 
 
+def truth_likelihood() -> Objective:
+    """Negative log-likelihood of the true attitude under the estimate: error and honesty in one."""
+    return Objective(truth=1.0)
+
+
+def most_probable() -> Objective:
+    """Innovation likelihood and prior: the most probable parameters given what was measured."""
+    return Objective(likelihood=1.0, prior=1.0)
+
+
+def prior() -> Objective:
+    """The prior alone, to be added to others."""
+    return Objective(prior=1.0)
+
+
 NAMED = {
     "attitude": attitude_error,
     "rate": rate_error,
     "position": position_error,
     "likelihood": innovation_likelihood,
+    "truth": truth_likelihood,
+    "map": most_probable,
+    "prior": prior,
 }
 
 
@@ -98,32 +149,36 @@ def parse(text: str) -> Objective:
     return total
 
 
+def shared(params: Parameters, data: Data) -> Parameters:
+    """The same parameters for each run of the data."""
+    return parameters.for_runs(params, data.setup, data.steps.dt.shape[0])
+
+
 def run_batch(
-    model: Model, params: Parameters, data: Data, keep: ekf.Keep = "means"
+    model: Model, every: Parameters, data: Data, keep: ekf.Keep = "means", *, smooth: bool = False
 ) -> ekf.FilterOutput:
-    """The filter over all runs with shared parameters."""
-    runs = data.steps.dt.shape[0]
-    every = parameters.for_runs(params, data.setup, runs)
-    cov = jax.vmap(model.initial_covariance)(every)
-    belief = Belief(data.means, cov)
-    return ekf.run_filter_batch(
-        model, every, belief, data.steps, keep=keep, devices=sharing_devices()
+    """The filter over all runs, `every` with the parameters of each; with `smooth` the updated beliefs are
+    the smoothed ones."""
+    belief = Belief(data.means, jax.vmap(model.initial_covariance)(every))
+    given, devices = (model, every, belief, data.steps), sharing_devices()
+    if not smooth:
+        return ekf.run_filter_batch(*given, keep=keep, devices=devices)
+    found = run_smoother_batch(*given, devices=devices)
+    return found.filtered._replace(
+        instants=found.filtered.instants._replace(updated=found.smoothed)
     )
 
 
-def output_values(
-    model: Model, params: Parameters, setup: Any, output: ekf.FilterOutput, name: str
-) -> Any:
+def output_values(model: Model, every: Parameters, output: ekf.FilterOutput, name: str) -> Any:
     """One of the model's outputs at every instant, leading axes (runs, K, S)."""
 
-    def of_run(setup: Any, means: Any, inputs: Any) -> Any:
+    def of_run(params: Parameters, means: Any, inputs: Any) -> Any:
         def value(x: Any, u: Any) -> Any:
-            return model.output(name).value(x, u, params._replace(setup=setup))
+            return model.output(name).value(x, u, params)
 
         return jax.vmap(jax.vmap(value))(means, inputs)
 
-    runs = output.instants.log_likelihood.shape[0]
-    return jax.vmap(of_run, axis_size=runs)(setup, output.instants.updated.mean, output.inputs)
+    return jax.vmap(of_run)(every, output.instants.updated.mean, output.inputs)
 
 
 def evaluate(
@@ -133,13 +188,24 @@ def evaluate(
     data: Data,
     counts: dict[str, Array] | None = None,
 ) -> Array:
-    """The objective of all runs, a scalar with a gradient to every parameter.
+    """The objective of all runs with the same parameters, a scalar with a gradient to each of them.
 
     Samples of all runs are pooled, so that a longer run weighs more. Where `data` is one group of several,
     `counts` are those of `count` over all groups: the values of the groups then add up to that of all.
     """
+    return evaluate_each(model, objective, shared(params, data), data, counts)
+
+
+def evaluate_each(
+    model: Model,
+    objective: Objective,
+    every: Parameters,
+    data: Data,
+    counts: dict[str, Array] | None = None,
+) -> Array:
+    """As `evaluate`, with the parameters of each run on the first axis of every leaf."""
     weights = weights_of(objective)
-    found = terms(model, params, data, tuple(weights), counts)
+    found = terms_each(model, every, data, tuple(weights), counts, smooth=objective.smoothed)
     return sum((weight * found[name] for name, weight in weights.items()), jnp.zeros(()))
 
 
@@ -150,6 +216,8 @@ def weights_of(objective: Objective) -> dict[str, float]:
         weights[name] = weights.get(name, 0.0) + weight
     if objective.likelihood:
         weights["likelihood"] = objective.likelihood
+    if objective.truth:
+        weights["truth"] = objective.truth
     return weights
 
 
@@ -158,7 +226,9 @@ def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
     found = {}
     for name in names:
         if name == "likelihood":
-            found[name] = _visible_rows(data)
+            found[name] = visible_rows(data)
+        elif name == "truth" and "attitude" in data.truth:
+            found[name] = jnp.sum(data.truth["attitude"].judged)
         elif name in data.truth:
             found[name] = jnp.sum(data.truth[name].judged)
     return found
@@ -171,28 +241,70 @@ def terms(
     names: tuple[str, ...],
     counts: dict[str, Array] | None = None,
 ) -> dict[str, Array]:
+    """As `terms_each`, with the same parameters for all runs."""
+    return terms_each(model, shared(params, data), data, names, counts)
+
+
+def terms_each(
+    model: Model,
+    every: Parameters,
+    data: Data,
+    names: tuple[str, ...],
+    counts: dict[str, Array] | None = None,
+    *,
+    smooth: bool = False,
+) -> dict[str, Array]:
     """Single terms of an objective, unweighted, from one run of the filter.
 
-    An output's name stands for its mean squared error, ``likelihood`` for the negative mean
-    log-likelihood of a visible row. `counts` as in `evaluate`.
+    An output's name stands for its mean squared error, ``likelihood`` for the negative mean log-likelihood
+    of a measured row, ``truth`` for that of the true attitude under the estimate. `counts` is as in
+    `evaluate`.
     """
-    output = run_batch(model, params, data)
+    keep: ekf.Keep = "estimates" if "truth" in names else "means"
+    output = run_batch(model, every, data, keep, smooth=smooth)
     counts = count(data, names) if counts is None else counts
     found: dict[str, Array] = {}
     for name in names:
         if name == "likelihood":
             likelihood = jnp.where(data.counted, output.instants.log_likelihood, 0.0)
-            found[name] = -jnp.sum(likelihood) / jnp.maximum(counts[name], 1)
-            continue
-        error = output_error(model, params, output, data, name)
-        judged = data.truth[name].judged
-        squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
-        found[name] = _scale(model, name) * squared / jnp.maximum(counts[name], 1)
+            total = -jnp.sum(likelihood)
+        elif name == "truth":
+            total = _truth_unlikelihood(model, every, output, data)
+        else:
+            error = output_error(model, every, output, data, name)
+            judged = data.truth[name].judged
+            squared = jnp.sum(jnp.where(judged, jnp.sum(error * error, axis=-1), 0.0))
+            total = _scale(model, name) * squared
+        found[name] = total / jnp.maximum(counts[name], 1)
     return found
 
 
+def _truth_unlikelihood(
+    model: Model, every: Parameters, output: ekf.FilterOutput, data: Data
+) -> Array:
+    """Sum of the negative log-likelihoods of the true attitudes under the estimated ones."""
+    error, cov = error_and_covariance(model, every, output, data)
+    judged = data.truth["attitude"].judged
+    factor = jnp.linalg.cholesky(cov)
+    white = jax.scipy.linalg.solve_triangular(factor, error[..., None], lower=True)[..., 0]
+    logs = jnp.sum(jnp.log(jnp.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)
+    each = 0.5 * jnp.sum(white * white, axis=-1) + logs + 1.5 * jnp.log(2.0 * jnp.pi)
+    return jnp.sum(jnp.where(judged, each, 0.0))
+
+
+def error_and_covariance(
+    model: Model, every: Parameters, output: ekf.FilterOutput, data: Data
+) -> tuple[Array, Array]:
+    """Attitude errors (runs, K, S, 3) and their covariances; the identity where nothing is judged."""
+    error = output_error(model, every, output, data, "attitude")
+    _, cov = evaluate_outputs(model, every, output)["attitude"]
+    judged = data.truth["attitude"].judged
+    eye = jnp.broadcast_to(jnp.eye(cov.shape[-1]), cov.shape)
+    return error, jnp.where(judged[..., None, None], cov, eye)
+
+
 def output_error(
-    model: Model, params: Parameters, output: ekf.FilterOutput, data: Data, name: str
+    model: Model, every: Parameters, output: ekf.FilterOutput, data: Data, name: str
 ) -> Array:
     """Error vector of an output against truth, (runs, K, S, d), in the output's own frame."""
     if name not in data.truth:
@@ -201,12 +313,20 @@ def output_error(
             f" '{model.name}' puts out and the encoder knows; choose another objective"
         )
     space = model.output(name).space
-    values = output_values(model, params, data.setup, output, name)
+    values, truth = output_values(model, every, output, name), data.truth[name]
+    true = truth.value
+    if every.truth:
+
+        def there(frame: TruthFrame, *known: Array) -> Array:
+            return corrected(frame, name, *known)
+
+        over = jax.vmap(jax.vmap(there, in_axes=(None, 0, 0, 0)), in_axes=(None, 0, 0, 0))
+        true = jax.vmap(over)(every.truth, truth.value, truth.first, truth.second)
 
     def error(value: Any, truth: Any) -> Array:
         return manifold.local(space, value, truth)
 
-    return jax.vmap(jax.vmap(jax.vmap(error)))(values, data.truth[name].value)
+    return jax.vmap(jax.vmap(jax.vmap(error)))(values, true)
 
 
 def _scale(model: Model, name: str) -> float:
@@ -215,7 +335,7 @@ def _scale(model: Model, name: str) -> float:
     return _DEGREES_SQUARED if unit.startswith("rad") else 1e6 if unit == "m" else 1.0
 
 
-def _visible_rows(data: Data) -> Array:
+def visible_rows(data: Data) -> Array:
     """Number of rows whose likelihood counts."""
     total = jnp.zeros((), int)
     for name, rows in (data.steps.fast | data.steps.slow).items():

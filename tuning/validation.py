@@ -37,9 +37,12 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    model: str | Model, runs: Sequence[Run], variants: Mapping[str, Parameters]
+    model: str | Model,
+    runs: Sequence[Run],
+    variants: Mapping[str, Parameters | Sequence[Parameters]],
 ) -> Comparison:
-    """Estimate every run with every choice of parameters; the first rows hold the last tracker sample.
+    """Estimate every run with every choice of parameters, one set or a list of each run's own; the first
+    rows hold the last tracker sample.
 
     The rate of `hold last` is the gyroscope's own; it has no covariance, so that NIS and NEES are NaN.
     """

@@ -1,6 +1,7 @@
 """`jaxekf tune`: noise, and calibration where asked, from recorded runs."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 import jax
@@ -20,9 +21,12 @@ from jaxekf.cli.console import (
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.files import check_output
+from jaxekf.model import Parameters
 from jaxekf.models import get_model
+from jaxekf.recording import Recording
 from tuning.noise import AXES
 from tuning.objectives import parse
+from tuning.spec import read_free
 from tuning.validation import as_dicts
 
 
@@ -46,6 +50,18 @@ from tuning.validation import as_dicts
     "--free",
     multiple=True,
     help="What may change: noise, calibration, initial or one leaf; repeatable.  [default: noise]",
+)
+@click.option(
+    "--own",
+    multiple=True,
+    help="What may change and each run has its own of, such as calibration.alignment; repeatable.",
+)
+@click.option(
+    "--parameters",
+    "spec",
+    type=click.Path(path_type=Path),
+    help="What may change, with priors and bounds, as [[free]] tables in a TOML file: name, each_run,"
+    " prior, bounds.",
 )
 @click.option(
     "--axes",
@@ -73,6 +89,18 @@ from tuning.validation import as_dicts
     default=None,
     help="Scale Q, R and P0 so that errors match them.  [default: unless the likelihood counts]",
 )
+@click.option("--smooth", is_flag=True, help="Errors are those of the smoothed estimate.")
+@click.option(
+    "--judge/--no-judge",
+    default=True,
+    show_default=True,
+    help="Tell what the data determine, with 95 % intervals; what they leave open stays at its start.",
+)
+@click.option(
+    "--state",
+    type=click.Path(path_type=Path),
+    help="Keep the state of the tuning in this file after each step; if it is there, go on from it.",
+)
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
 )
@@ -85,11 +113,16 @@ def tune(
     noise_files: tuple[str, ...],
     objective: str,
     free: tuple[str, ...],
+    own: tuple[str, ...],
+    spec: Path | None,
     axes: str | None,
     iterations: int,
     patience: int,
     burn_in: float,
     rescale: bool | None,
+    smooth: bool,
+    judge: bool,
+    state: Path | None,
     output: Path,
     overwrite: bool,
     as_json: bool,
@@ -103,7 +136,9 @@ def tune(
     start = parameters.load(chosen, *noise_files)
     training, held_out = load_runs(runs), load_runs(validate)
     aim = parse(objective)
-    if aim.errors:
+    asked = [*free, *(read_free(spec) if spec else ())]
+    asked += [tuning.Free(name, each_run=True) for name in own]
+    if aim.needs_truth:
         for run in training + held_out:
             if run.encoder is None:
                 note(f"run '{run.name}' has no encoder and does not count in the error")
@@ -113,32 +148,79 @@ def tune(
             validate=held_out,
             model=chosen,
             objective=aim,
-            free=list(free) or None,
+            free=asked or None,
             start=start,
             axes=axes,
             iterations=iterations,
             patience=patience,
             burn_in_s=burn_in,
             rescale=rescale,
+            smooth=smooth,
+            judge=judge,
+            checkpoint=state,
             progress=progress,
         )
     tuned.save(output)
     note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
-    judged = held_out or training
-    scored = [run for run in judged if run.encoder is not None]
-    rows = []
-    if scored:
-        rows = tuning.compare(chosen, scored, {"start": start, "tuned": tuned.params}).rows
+    for label, more in tuned.open.items():
+        note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
+    scored = [run for run in held_out or training if run.encoder is not None]
+    rows = _compare(tuned, scored, start, bool(held_out)) if scored else []
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
-        print_json(document | {"rows": as_dicts(rows), "rejected_steps": tuned.rejections})
+        document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
+        print_json(document | _known(tuned))
         return
     _print_noise(tuned)
+    _print_known(tuned)
     if rows:
         on = "validation runs" if held_out else "the training runs themselves"
         print_comparison(f"On {on}", rows)
+
+
+def _compare(
+    tuned: tuning.Tuned,
+    runs: list[Recording],
+    start: Parameters,
+    held_out: bool,
+) -> list[tuning.Row]:
+    """Start and tuned parameters beside each other; a held-out run's own are found without its truth."""
+    found = tuning.fit_runs(runs, tuned) if held_out else {}
+    own = [found.get(run.name, tuned.of_run(run)) for run in runs]
+    return tuning.compare(tuned.model, runs, {"start": start, "tuned": own}).rows
+
+
+def _known(tuned: tuning.Tuned) -> dict[str, Any]:
+    """Intervals, what was left open, what each run has of its own and the truth's frame, for JSON."""
+    each = {name: parameters.to_document(tuned.model, p, {}) for name, p in tuned.each.items()}
+    truth = None
+    if tuned.truth is not None:
+        truth = {name: np.asarray(v).tolist() for name, v in tuned.truth._asdict().items()}
+    return {
+        "intervals": {label: list(ends) for label, ends in tuned.intervals.items()},
+        "left_open": tuned.open,
+        "truth": truth,
+        "own": {
+            name: {k: told[k] for k in ("noise", "calibration")} for name, told in each.items()
+        },
+    }
+
+
+def _print_known(tuned: tuning.Tuned) -> None:
+    """Value and interval of each number that the data determine, and how far it moved."""
+    if not tuned.intervals:
+        return
+    first = dict(zip(tuned.layout.labels(), tuned.moved, strict=True))
+    rows = []
+    for label, ends in tuned.intervals.items():
+        rows.append([label, *(f"{end:.5g}" for end in ends), first[label]])
+    print_table(
+        "What is known (SI, before the common scale)",
+        ["number", "tuned", "95 %: from", "to", "moved by"],
+        rows,
+    )
 
 
 def _print_noise(tuned: tuning.Tuned) -> None:

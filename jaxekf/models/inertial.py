@@ -54,6 +54,12 @@ class Calibration(NamedTuple):
     """Metres from where the tool's frame is said to be in the body to where it is, body frame; (3,)."""
     alignment: Any
     """Rotation vector from the tool's frame as it is said to be to what it is, body frame, rad; (3,)."""
+    clock_drift: Any = 0.0
+    """Seconds that the IMU's clock gains on the tracker's in a second; ()."""
+    gyroscope_matrix: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Scale, non-orthogonality and alignment, ``rate = gyroscope_matrix @ measured - bias``, (3, 3)."""
+    accelerometer_matrix: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """The same of the accelerometer; its frame should be the gyroscope's, (3, 3)."""
 
 
 class Setup(NamedTuple):
@@ -84,8 +90,15 @@ INITIAL = Initial(
 )
 INITIAL_UNITS = Initial("m", "rad", "m/s", "rad/s", "m/s^2")
 
-CALIBRATION = Calibration(latency=np.array(0.0), lever_arm=np.zeros(3), alignment=np.zeros(3))
-CALIBRATION_UNITS = Calibration("s", "m", "rad")
+CALIBRATION = Calibration(
+    latency=np.array(0.0),
+    lever_arm=np.zeros(3),
+    alignment=np.zeros(3),
+    clock_drift=np.array(0.0),
+    gyroscope_matrix=np.eye(3),
+    accelerometer_matrix=np.eye(3),
+)
+CALIBRATION_UNITS = Calibration("s", "m", "rad", "s/s", "1", "1")
 
 SETUP = Setup(np.array(STANDARD_GRAVITY), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
@@ -98,8 +111,8 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
     theta x (theta x f) / 24`` times dt^2, up to ``theta^3``. ``w`` holds angle, velocity, and the changes
     of both biases.
     """
-    force = u.mean[3:] - x.accelerometer_bias
-    turn = (u.mean[:3] - x.bias) * dt
+    force = params.calibration.accelerometer_matrix @ u.mean[3:] - x.accelerometer_bias
+    turn = _rate(x, u.mean, params) * dt
     once = jnp.cross(turn, force)
     twice = jnp.cross(turn, once)
     gained = (force + once / 2.0 + twice / 6.0) * dt + w[3:6]
@@ -164,12 +177,17 @@ def clock_offset(params: Parameters) -> Array:
     return -params.calibration.latency
 
 
-def _rate(x: State, u: InputSample) -> Array:
-    return u.value[:3] - x.bias
+def clock_drift(params: Parameters) -> Array:
+    """Seconds that the IMU's clock gains in a second."""
+    return params.calibration.clock_drift
+
+
+def _rate(x: State, measured: Array, params: Parameters) -> Array:
+    return params.calibration.gyroscope_matrix @ measured[:3] - x.bias
 
 
 def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
-    swing = jnp.cross(_rate(x, u), params.setup.p_body_object)
+    swing = jnp.cross(_rate(x, u.value, params), params.setup.p_body_object)
     return x.velocity + rotation.rotate(x.q_ref_body, swing)
 
 
@@ -195,7 +213,13 @@ OUTPUTS = (
     Output("position", _IN_REFERENCE, "reference", lambda x, u, params: x.position),
     Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
     Output("velocity", _SPEED, "reference", lambda x, u, params: x.velocity),
-    Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: _rate(x, u), rate_noise),
+    Output(
+        "rate",
+        Euclidean(3, "rad/s"),
+        "body",
+        lambda x, u, params: _rate(x, u.value, params),
+        rate_noise,
+    ),
     Output(
         "object_position",
         _IN_REFERENCE,

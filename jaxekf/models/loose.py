@@ -38,12 +38,17 @@ class Noise(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """What is not random: ``rate = gyroscope_matrix @ (measured - bias - noise)``."""
+    """What is not random: ``rate = exp(alignment) @ gyroscope_matrix @ (measured - bias - noise)``."""
 
     gyroscope_matrix: Any
     """Scale, non-orthogonality and alignment of the gyroscope to the tool's frame, (3, 3)."""
     clock_offset: Any
     """Seconds to add to the tracker's time to get the IMU's, positive where the IMU lags; ()."""
+    alignment: Any = (0.0, 0.0, 0.0)
+    """Rotation vector from the IMU's frame to the tool's, (3,): what changes when the IMU is mounted anew,
+    while scale and non-orthogonality stay. One of it and the rotation in `gyroscope_matrix` is enough."""
+    clock_drift: Any = 0.0
+    """Seconds that the IMU's clock gains on the tracker's in a second; ()."""
 
 
 class Initial(NamedTuple):
@@ -58,14 +63,19 @@ class Initial(NamedTuple):
 SPACE: Any = State(SO3(), Euclidean(3, "rad/s"))
 
 
+def rate_matrix(params: Parameters) -> Array:
+    """From the gyroscope's axes to the tool's rate, (3, 3)."""
+    turn = rotation.to_matrix(rotation.exp(params.calibration.alignment))
+    return turn @ params.calibration.gyroscope_matrix
+
+
 def _rate(x: State, measured: Array, params: Parameters) -> Array:
-    return params.calibration.gyroscope_matrix @ (measured - x.bias)
+    return rate_matrix(params) @ (measured - x.bias)
 
 
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
-    """``q exp(gyroscope_matrix @ ((mean rate - bias) dt + w_angle))`` and ``bias + w_bias``."""
-    matrix = params.calibration.gyroscope_matrix
-    turn = matrix @ ((u.mean - x.bias) * dt + w[:3])
+    """``q exp(rate_matrix @ ((mean rate - bias) dt + w_angle))`` and ``bias + w_bias``."""
+    turn = rate_matrix(params) @ ((u.mean - x.bias) * dt + w[:3])
     return State(SO3().retract(x.q_ref_body, turn), x.bias + w[3:])
 
 
@@ -108,7 +118,7 @@ def initial_covariance(params: Parameters) -> Array:
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:
     """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
-    matrix = params.calibration.gyroscope_matrix
+    matrix = rate_matrix(params)
     white = linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth
     return matrix @ white @ matrix.T
 
@@ -119,13 +129,18 @@ DEFAULTS = Parameters(
         bias_walk=np.deg2rad(0.005),
         optical=np.deg2rad(0.3),
     ),
-    Calibration(gyroscope_matrix=np.eye(3), clock_offset=np.array(0.0)),
+    Calibration(
+        gyroscope_matrix=np.eye(3),
+        clock_offset=np.array(0.0),
+        alignment=np.zeros(3),
+        clock_drift=np.array(0.0),
+    ),
     Initial(attitude=np.deg2rad(10.0), bias=np.deg2rad(1.0)),
 )
 
 UNITS = Parameters(
     Noise("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "rad"),
-    Calibration("1", "s"),
+    Calibration("1", "s", "rad", "s/s"),
     Initial("rad", "rad/s"),
 )
 
@@ -142,7 +157,12 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=initial_covariance,
     start_with=("optical",),
-    input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
+    input=Input(
+        "gyroscope",
+        sources.gyroscope,
+        lambda params: params.calibration.clock_offset,
+        lambda params: params.calibration.clock_drift,
+    ),
     outputs=(
         Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
         Output(

@@ -168,6 +168,6 @@ MODEL = Model(
     initial_covariance=inertial.initial_covariance,
     find_start=find_start,
     setup=_setup,
-    input=Input("imu", sources.imu, inertial.clock_offset),
+    input=Input("imu", sources.imu, inertial.clock_offset, inertial.clock_drift),
     outputs=inertial.OUTPUTS,
 )

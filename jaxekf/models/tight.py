@@ -183,7 +183,7 @@ def _build(names: tuple[str, ...], params: Parameters) -> Model:
         find_start=find_start,
         adapt=adapt,
         setup=partial(_setup, names),
-        input=Input("imu", sources.imu, inertial.clock_offset),
+        input=Input("imu", sources.imu, inertial.clock_offset, inertial.clock_drift),
         outputs=inertial.OUTPUTS,
     )
 

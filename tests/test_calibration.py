@@ -1,0 +1,352 @@
+"""Calibration with the noise: parameters of each run, of the truth, what is known of them, and going on."""
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+import jaxekf
+import tuning
+from jaxekf import jit, simulate
+from jaxekf.errors import TuningError
+from jaxekf.parameters import as_arrays
+from jaxekf.recording import from_scipy, to_scipy
+from tuning import noise, objectives
+from tuning.frame import no_correction
+from tuning.information import information
+
+MODEL = jaxekf.get_model("loose")
+OFFSET_S = 0.004
+MOUNTED = np.deg2rad([[0.6, -0.4, 0.5], [-0.5, 0.3, 0.8], [1.0, 0.7, -0.6]])
+"""How the IMU is mounted in each run: rotation vectors from its frame to the tool's."""
+
+
+def mounted(index, seed=None, duration_s=10.0, **motion):
+    """A run whose IMU lags and is turned against the tool."""
+    seed = index if seed is None else seed
+    run = simulate.recording(
+        f"run-{index}",
+        simulate.free_motion(seed, speed_deg=60.0, rest_s=0.5, **motion),
+        seed=seed,
+        duration_s=duration_s,
+    )
+    imu = run.need_imu()
+    turned = Rotation.from_rotvec(MOUNTED[index % 3]).inv().apply(imu.gyroscope)
+    late = replace(imu, time_ns=imu.time_ns + round(OFFSET_S * 1e9), gyroscope=turned)
+    return run.replace(imu=late)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return [mounted(i) for i in range(3)]
+
+
+FREE = (
+    "noise",
+    "calibration.clock_offset",
+    tuning.Free("calibration.alignment", each_run=True),
+)
+
+
+@pytest.fixture(scope="module")
+def tuned(runs):
+    return tuning.tune(runs[:2], objective="map", free=FREE, judge=True, iterations=20)
+
+
+def test_each_run_has_its_own(runs, tuned):
+    """Would catch runs that are given each other's parameters, and intervals that do not hold the truth."""
+    assert len(tuned.intervals) == 9  # the bias walk is left open
+    labels = {
+        f"calibration.alignment[{i}] of run {k}": MOUNTED[k][i] for k in (0, 1) for i in range(3)
+    }
+    labels["calibration.clock_offset"] = OFFSET_S
+    labels["noise.optical"] = np.deg2rad(0.3)
+    for label, true in labels.items():
+        value, low, high = tuned.intervals[label]
+        assert low < value < high
+        # Of eight intervals of 95 % one may miss; by twice its width none.
+        assert abs(true - value) < 2.0 * max(high - value, value - low), label
+    for k in (0, 1):
+        own = tuned.each[f"run-{k}"]
+        assert own.noise.optical == tuned.params.noise.optical
+        np.testing.assert_allclose(own.calibration.alignment, MOUNTED[k], atol=3e-3)
+    mean = MOUNTED[:2].mean(axis=0)
+    np.testing.assert_allclose(tuned.params.calibration.alignment, mean, atol=3e-3)
+
+
+def test_what_is_left_open_stays_at_its_start(tuned):
+    """Would catch a bias walk that ten seconds do not tell and that is tuned to nothing (row 8)."""
+    assert list(tuned.open) == ["noise.bias_walk"]
+    assert "minutes" in tuned.open["noise.bias_walk"]
+    assert tuned.params.noise.bias_walk == tuned.start.noise.bias_walk
+    assert tuned.origin["left_open"] == ["noise.bias_walk"]
+
+
+def test_held_out_runs_are_fitted_without_their_truth(runs, tuned, tmp_path):
+    """Would catch a held-out run's truth that leaks into its parameters, and files that lack a run."""
+    found = tuning.fit_runs(runs[2:], tuned)["run-2"]
+    blind = tuning.fit_runs([runs[2].replace(encoder=None)], tuned)["run-2"]
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(blind), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(found.calibration.alignment, MOUNTED[2], atol=3e-3)
+    assert found.noise == tuned.params.noise
+    tuned.save(tmp_path)
+    again = jaxekf.load_parameters(MODEL, tmp_path / "runs" / "run-1")
+    np.testing.assert_allclose(
+        again.calibration.alignment, tuned.each["run-1"].calibration.alignment
+    )
+
+
+def test_parameters_of_each_run_estimate_it(runs, tuned):
+    """Would catch estimates that mix up whose parameters are whose."""
+    own = [tuned.of_run(run) for run in runs[:2]]
+    both = jaxekf.estimate_many(runs[:2], "loose", own)
+    for run, params, made in zip(runs[:2], own, both, strict=True):
+        alone = jaxekf.estimate(run, "loose", params)
+        np.testing.assert_allclose(made.attitude.value, alone.attitude.value, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(
+            made.params.calibration.alignment, params.calibration.alignment
+        )
+    with pytest.raises(ValueError, match="as many as the 2 runs"):
+        jaxekf.estimate_many(runs[:2], "loose", own[:1])
+
+
+LEAVES = (
+    tuning.Free("noise.optical", bounds=(1e-4, 0.1)),
+    tuning.Free("noise.gyroscope", each_run=True),
+    tuning.Free("calibration.alignment", each_run=True, bounds=(-0.5, 0.5)),
+    "calibration.clock_drift",
+    "truth",
+)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=27, max_size=27))
+def test_a_run_is_filtered_with_its_own_numbers(values):
+    """Would catch an index that is off by a run, or bounds that are not kept or do not invert."""
+    base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
+    where = noise.layout(MODEL, base, LEAVES, runs=4)
+    assert len(where.labels()) == len(where.prior) == 27
+    free = jnp.asarray(values)
+    params = where.from_free(free, base)
+    np.testing.assert_allclose(where.to_free(params), free, rtol=1e-6, atol=1e-6)
+    assert 1e-4 < params.noise.optical < 0.1
+    assert np.abs(params.calibration.alignment).max() < 0.5
+    place = np.array([2, 0, 3])
+    every = where.of_runs(params, (), place)
+    flat = where.of_one_run()
+    for k, index in enumerate(where.index(place)):
+        alone = flat.from_free(free[index], base)
+        for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(every), strict=True):
+            np.testing.assert_allclose(one, other[k], rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def everything():
+    """Two short runs with all kinds of parameters free, off their start."""
+    base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
+    where = noise.layout(MODEL, base, (*LEAVES, "calibration.clock_offset", "initial"), runs=2)
+    data = tuning.prepare(MODEL, [mounted(i, duration_s=1.2) for i in range(2)])
+    rng = np.random.default_rng(5)
+    free = np.asarray(where.to_free(base)) + 0.1 * rng.standard_normal(len(where.labels()))
+    return where, base, data, free
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_gradients_of_every_kind(everything, smooth):
+    """Would catch a kind of parameter, or of objective, whose gradient is wrong or lost (row 3)."""
+    where, base, data, free = everything
+    aim = replace(objectives.parse("attitude+0.1*rate+0.2*truth+0.3*likelihood"), smoothed=smooth)
+
+    @jit
+    def value(free):
+        every = where.of_runs(where.from_free(free, base), data.setup, data.place)
+        return objectives.evaluate_each(MODEL, aim, every, data)
+
+    got = np.asarray(jax.jit(jax.grad(value))(jnp.asarray(free)))
+    expected, h = np.zeros_like(got), 2e-3
+    for i in range(len(free)):
+        step = np.zeros_like(free)
+        step[i] = h
+        f = [float(value(free + k * step)) for k in (-2, -1, 1, 2)]
+        expected[i] = (f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h)
+    assert np.linalg.norm(got - expected) <= 1e-6 * np.linalg.norm(expected)
+    assert np.all(np.abs(got) > 0.0)
+
+
+def test_gradients_are_finite_wherever_one_starts(everything):
+    """Would catch an overflow or a zero that is divided by, within three decades (row 3)."""
+    where, base, data, free = everything
+    data = jax.tree.map(lambda a: a[:1], data)
+    where = where.of_one_run()
+    free = np.asarray(where.to_free(base))
+    logs = np.concatenate([np.full(leaf.each, leaf.kind == "log") for leaf in where.leaves])
+    draws = 10_000 if os.environ.get("JAXEKF_LONG") == "1" else 1_000
+    rng = np.random.default_rng(6)
+    wide = np.where(logs, np.log(1e3) * rng.uniform(-1, 1, (draws, len(free))), 0.0)
+    wide += np.where(logs, 0.0, rng.uniform(-3, 3, (draws, len(free))))
+    aim = objectives.parse("attitude+likelihood+truth")
+
+    def value(free):
+        every = where.of_runs(where.from_free(free, base), data.setup, data.place)
+        return objectives.evaluate_each(MODEL, aim, every, data)
+
+    at_once = jit(jax.vmap(jax.value_and_grad(value)))
+    for some in np.split(free + wide, draws // 500):
+        found = at_once(jnp.asarray(some))
+        assert all(np.isfinite(np.asarray(a)).all() for a in found)
+
+
+def test_the_encoder_is_found_where_it_lies(runs):
+    """Would catch a truth whose clock or frame is corrected the wrong way round."""
+    run = mounted(0).replace(name="run")
+    encoder = run.need_encoder()
+    reference, body = np.deg2rad([0.5, -0.3, 0.4]), np.deg2rad([-0.2, 0.6, 0.3])
+    q = Rotation.from_rotvec(reference).inv() * to_scipy(encoder.q_ref_body)
+    q = q * Rotation.from_rotvec(body)
+    moved = replace(encoder, time_ns=encoder.time_ns + 8_000_000, q_ref_body=from_scipy(q))
+    start = MODEL.parameters._replace(
+        calibration=MODEL.parameters.calibration._replace(
+            alignment=MOUNTED[0], clock_offset=np.array(OFFSET_S)
+        )
+    )
+    found = tuning.tune(
+        [run.replace(encoder=moved)],
+        start=start,
+        free=["truth"],
+        objective="attitude",
+        iterations=30,
+        rescale=False,
+    )
+    assert float(found.truth.clock_offset) == pytest.approx(8e-3, abs=3e-4)
+    # A small turn of the reference and one of the body are told apart by the motion.
+    np.testing.assert_allclose(found.truth.reference, reference, atol=1.5e-3)
+    np.testing.assert_allclose(found.truth.alignment, body, atol=1.5e-3)
+    assert found.best.training**0.5 < 0.2
+    np.testing.assert_array_equal(found.params.noise.optical, start.noise.optical)
+
+
+def test_information_is_the_curvature(runs):
+    """Would catch an information that is off by a factor: over long data it is minus the second derivative
+    of the log-likelihood at its maximum."""
+    where = noise.layout(
+        MODEL, as_arrays(MODEL.parameters), ["noise.optical", "calibration.alignment"]
+    )
+    base = as_arrays(MODEL.parameters)
+    groups = (tuning.prepare(MODEL, runs[:1], need_truth=False),)
+    best = tuning.tune(
+        runs[:1],
+        objective="likelihood",
+        free=["noise.optical", "calibration.alignment"],
+        iterations=25,
+        rescale=False,
+    )
+    known = information(MODEL, where, best.free, base, groups)
+    rows = int(objectives.visible_rows(groups[0]))
+
+    def slope(free):
+        def total(free):
+            params = where.from_free(free, base)
+            aim = tuning.innovation_likelihood()
+            return rows * tuning.evaluate(MODEL, aim, params, groups[0])
+
+        return jax.grad(total)(free)
+
+    slope = jit(slope)
+    h, count = 1e-3, len(best.free)
+    curved = np.zeros((count, count))
+    for i in range(count):
+        step = np.zeros(count)
+        step[i] = h
+        ahead, behind = (np.asarray(slope(jnp.asarray(best.free + s * step))) for s in (1, -1))
+        curved[i] = (ahead - behind) / (2 * h)
+    np.testing.assert_allclose(np.diagonal(known.matrix), np.diagonal(curved), rtol=0.1)
+    off = (known.matrix - curved) / np.sqrt(np.outer(np.diagonal(curved), np.diagonal(curved)))
+    assert np.abs(off).max() < 0.1
+    np.testing.assert_allclose(known.score, -np.asarray(slope(jnp.asarray(best.free))), atol=0.5)
+
+
+SCRIPT = """
+import os, signal, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, sys.argv[2])
+import test_calibration as case
+
+def stop(step, total):
+    if step.number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+case.long_tuning(sys.argv[1], stop)
+"""
+
+
+def long_tuning(checkpoint=None, progress=None):
+    return tuning.tune(
+        [mounted(0, duration_s=2.0)],
+        free=["noise", "calibration.alignment"],
+        iterations=8,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_a_killed_tuning_goes_on(tmp_path):
+    """Would catch a state that is half written, or lacks what the optimiser knows (row 10)."""
+    file = tmp_path / "state.npz"
+    here = str(Path(__file__).parent)
+    code = subprocess.run([sys.executable, "-c", SCRIPT, str(file), here], check=False).returncode
+    assert code == -signal.SIGKILL
+    assert file.is_file()
+    seen = []
+    again = long_tuning(file, lambda step, total: seen.append(step.number))
+    assert seen[0] == 3
+    assert not file.exists()
+    straight = long_tuning()
+    for one, other in zip(
+        jax.tree.leaves(again.params), jax.tree.leaves(straight.params), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+    assert len(again.history) == len(straight.history)
+
+
+def test_another_tunings_state_is_refused(tmp_path, runs):
+    """Would catch a tuning that goes on from something else."""
+    file = tmp_path / "state.npz"
+    file.write_text("no state")
+    with pytest.raises(TuningError, match="no state of a tuning"):
+        long_tuning(file)
+    file.unlink()
+
+    def stop(step, total):
+        if step.number == 2:
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        long_tuning(file, stop)
+    with pytest.raises(TuningError, match="the state of another tuning"):
+        tuning.tune(runs[:1], iterations=8, checkpoint=file)
+
+
+@pytest.mark.parametrize(
+    ("free", "words"),
+    [
+        (tuning.Free("noise.optical", prior=0.0), "a prior of 0.0"),
+        (tuning.Free("noise.optical", bounds=(1.0, 2.0)), "bounds 1.0 and 2.0"),
+        (tuning.Free("truth.origin"), "truth.origin"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(free, words):
+    """Would catch a start outside its bounds, and truth where none is."""
+    with pytest.raises(TuningError, match=words):
+        noise.layout(MODEL, as_arrays(MODEL.parameters), [free])

@@ -1,0 +1,288 @@
+"""The tuner's loop: step, judge on runs that are not learnt from, keep the best, and go on after a stop."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from jaxekf.errors import TuningError
+from jaxekf.kernels import jit
+from jaxekf.model import Model, Parameters
+from jaxekf.recording import Flags, Floats
+from tuning.data import Data
+from tuning.information import of_runs
+from tuning.noise import Layout
+from tuning.objectives import Objective, count, evaluate_each, visible_rows, weights_of
+from tuning.walk import Walk
+
+_IMPROVEMENT = 1e-4
+_OWN_STEPS = 2
+"""Steps of Fisher scoring on a held-out run's own parameters each time it judges."""
+
+
+class Iteration(NamedTuple):
+    """One step of the tuner."""
+
+    number: int
+    training: float
+    validation: float
+    """NaN without validation runs."""
+    rejected: bool
+    """The objective or its gradient was not finite; the step was shortened."""
+
+
+Progress = Callable[[Iteration, int], None]
+
+
+class Best(NamedTuple):
+    """The best so far."""
+
+    free: Any
+    step: Iteration
+
+
+def _objective_value(
+    model: Model,
+    objective: Objective,
+    where: Layout,
+    free: Array,
+    base: Parameters,
+    data: Data,
+    counts: dict[str, Array],
+) -> Array:
+    every = where.of_runs(where.from_free(free, base), data.setup, data.place)
+    return evaluate_each(model, objective, every, data, counts)
+
+
+_value = jit(_objective_value, static_argnums=(0, 1, 2))
+_value_and_gradient = jit(jax.value_and_grad(_objective_value, 3), static_argnums=(0, 1, 2))
+
+
+def on_host(free: Any) -> Any:
+    """The vector without its place: a gradient comes back shared among the devices, and a point found
+    from it would be another argument to compile for."""
+    return np.asarray(free)
+
+
+def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Array]:
+    """What each term of the objective is the mean over, of all groups together."""
+    found = [count(data, tuple(weights_of(objective))) for data in groups]
+    return {name: sum((f[name] for f in found), jnp.zeros((), int)) for name in found[0]}
+
+
+@dataclass
+class Descent:
+    """The optimiser's loop and what it works on."""
+
+    model: Model
+    objective: Objective
+    layout: Layout
+    base: Parameters
+    training: tuple[Data, ...]
+    validation: tuple[Data, ...] | None
+    iterations: int
+    """At most."""
+    optimiser: optax.GradientTransformation | None = None
+    keep: Callable[[dict[str, Any]], None] | None = None
+    """Called after each step with all that the loop goes on from."""
+    fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
+    """(n,) numbers that stay at their start."""
+    best: Best | None = None
+    history: list[Iteration] = field(default_factory=list)
+    rounds: int = 0
+    evaluations: int = 0
+    """Of the objective with its gradient."""
+
+    def __post_init__(self) -> None:
+        self.start = on_host(self.layout.to_free(self.base))
+        if not self.fixed.size:
+            self.fixed = np.zeros(len(self.start), bool)
+        self.walk = Walk(jnp.asarray(self.start), self.optimiser)
+        self.since = 0
+        self.own_free: Floats | None = None
+        self.fallback: Best | None = None
+
+    @cached_property
+    def training_counts(self) -> dict[str, Array]:
+        """What the terms are the means over."""
+        return total_counts(self.training, self.objective)
+
+    @cached_property
+    def validation_counts(self) -> dict[str, Array]:
+        """The same of the validation runs."""
+        return total_counts(self.validation or (), self.objective)
+
+    @cached_property
+    def _prior_weight(self) -> float:
+        rows = sum(int(visible_rows(data)) for data in self.training)
+        return self.objective.prior / max(rows, 1)
+
+    def value_and_gradient(self, free: Any) -> tuple[float, Array]:
+        """The objective of the training runs, prior included."""
+        counts, plain = self.training_counts, on_host(free)
+        found = [
+            _value_and_gradient(
+                self.model, self.objective, self.layout, plain, self.base, data, counts
+            )
+            for data in self.training
+        ]
+        self.evaluations += 1
+        gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
+        off = (plain - self.start) / self.layout.prior
+        gradient = gradient + self._prior_weight * off / self.layout.prior
+        gradient = np.where(self.fixed, 0.0, gradient)
+        value = sum(float(value) for value, _ in found)
+        return value + 0.5 * self._prior_weight * float(off @ off), jnp.asarray(gradient)
+
+    def validation_value(self, free: Any) -> float:
+        """The objective of the validation runs; their own parameters come from their innovations."""
+        if self.validation is None:
+            return float("nan")
+        counts, where, plain = self.validation_counts, self.layout, on_host(free)
+        if where.own:
+            where, plain = self._with_own(plain)
+        return float(
+            sum(
+                _value(self.model, self.objective, where, plain, self.base, data, counts)
+                for data in self.validation
+            )
+        )
+
+    def _with_own(self, free: Any) -> tuple[Layout, Floats]:
+        """The layout of the validation runs and a vector with their own parameters, a little nearer to the
+        most probable ones than the last time."""
+        assert self.validation is not None
+        total = sum(len(data.place) for data in self.validation)
+        where = self.layout.for_runs_number(total)
+        params = self.layout.together(self.layout.from_free(free, self.base))
+        plain = on_host(where.to_free(params))
+        own = where.is_own
+        if self.own_free is not None:
+            plain[own] = self.own_free
+        centre = on_host(where.to_free(params))
+        for _ in range(_OWN_STEPS):
+            plain = own_step(self.model, where, plain, centre, self.base, self.validation)
+        self.own_free = plain[own]
+        return where, plain
+
+    def run(self, patience: int, progress: Progress | None) -> str:
+        """Step until done; why it stopped."""
+        try:
+            return self._step(patience, progress)
+        except KeyboardInterrupt:
+            self.best = self.best or self.fallback
+            if self.best is None:
+                raise
+            return "interrupted; the best so far is kept"
+
+    def again(self, fixed: Flags) -> None:
+        """Go on from the best with more numbers held at their start, judged anew."""
+        assert self.best is not None
+        self.fixed = fixed
+        free = np.where(fixed, self.start, on_host(self.best.free))
+        self.walk = Walk(jnp.asarray(free), self.optimiser)
+        self.fallback = self.best._replace(free=free)
+        self.best, self.rounds, self.since = None, self.rounds + 1, len(self.history)
+        # Enough to come back from the start of a few numbers.
+        self.iterations = max(self.iterations, len(self.history) + 10)
+
+    def _step(self, patience: int, progress: Progress | None) -> str:
+        while len(self.history) < self.iterations:
+            number = len(self.history)
+            value, gradient = self.value_and_gradient(self.walk.candidate)
+            finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
+            held = self.validation_value(self.walk.candidate) if finite else float("nan")
+            step = Iteration(number, value, held, not finite)
+            self.history.append(step)
+            if progress is not None:
+                progress(step, self.iterations)
+            self._judge(step, finite)
+            if number - self.since >= patience:
+                return f"no improvement in {patience} iterations"
+            if reason := self.walk.move(value, gradient, bool(finite)):
+                return reason
+            if self.keep is not None:
+                self.keep(self.state_dict())
+        if self.best is None:
+            raise TuningError(
+                f"got {self.iterations} iterations, expected at least one; ask for more"
+            )
+        return f"the {self.iterations} iterations asked for are done"
+
+    def _judge(self, step: Iteration, finite: bool) -> None:
+        """Keep the step if it is the best."""
+        judged = self._judged(step)
+        before = float("inf") if self.best is None else self._judged(self.best.step)
+        if finite and judged < before:
+            if judged < before - _IMPROVEMENT * abs(judged):
+                self.since = step.number
+            self.best = Best(on_host(self.walk.candidate), step)
+        if self.best is None:
+            raise TuningError(
+                f"got an objective of {judged} or a gradient that is not finite at the start,"
+                " expected finite ones; start from other noise or check the data"
+            )
+
+    def _judged(self, step: Iteration) -> float:
+        return step.training if self.validation is None else step.validation
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the loop goes on from, as arrays by name."""
+        assert self.best is not None
+        found = {f"walk_{name}": value for name, value in self.walk.state_dict().items()}
+        found |= {
+            "history": np.array(self.history, float),
+            "best_free": np.asarray(self.best.free),
+            "best_number": np.array(self.best.step.number),
+            "since": np.array(self.since),
+            "rounds": np.array(self.rounds),
+            "iterations": np.array(self.iterations),
+            "evaluations": np.array(self.evaluations),
+            "fixed": self.fixed,
+        }
+        if self.own_free is not None:
+            found["own_free"] = np.asarray(self.own_free)
+        return found
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from where `state_dict` was taken."""
+        self.fixed = np.asarray(kept["fixed"], bool)
+        self.walk.restore({k.removeprefix("walk_"): v for k, v in kept.items()})
+        self.history = [
+            Iteration(int(n), float(t), float(v), bool(r)) for n, t, v, r in kept["history"]
+        ]
+        self.best = Best(kept["best_free"], self.history[int(kept["best_number"])])
+        self.since, self.rounds = int(kept["since"]), int(kept["rounds"])
+        self.evaluations, self.iterations = int(kept["evaluations"]), int(kept["iterations"])
+        self.own_free = kept.get("own_free")
+
+
+def own_step(
+    model: Model,
+    where: Layout,
+    free: Floats,
+    centre: Floats,
+    base: Parameters,
+    groups: Sequence[Data],
+) -> Floats:
+    """A step of Fisher scoring on what each run has of its own, by its innovations and the prior about
+    `centre`; what is shared stays."""
+    own = where.own_of_one_run
+    prior = np.concatenate([np.full(leaf.each, leaf.prior) for leaf in where.leaves])[own] ** -2.0
+    found = free.copy()
+    for data in groups:
+        index = where.index(np.asarray(data.place))
+        matrix, slope = of_runs(model, where, free[index], base, data, own)
+        at = index[:, own]
+        slope = slope - prior * (free[at] - centre[at])
+        step = np.linalg.solve(matrix + np.diag(prior), slope[..., None])[..., 0]
+        # Not farther than a prior's deviation at once: far from the answer the model is not linear.
+        longest = np.max(np.abs(step) * np.sqrt(prior), axis=1, keepdims=True)
+        found[at] = free[at] + step / np.maximum(longest, 1.0)
+    return found

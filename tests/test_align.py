@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -215,3 +216,27 @@ def test_command_prints_and_replaces(tmp_path):
     refused = call("--overwrite", "--model", "loose_rate")
     assert refused.exit_code == 1 and "no clock to calibrate" in refused.output
     assert (tmp_path / "out" / "calibration.toml").is_file()
+
+
+class Drifting(NamedTuple):
+    """Calibration of a model whose clock may drift."""
+
+    clock_offset: float
+    clock_drift: float
+
+
+def test_drift_for_a_model_that_has_one():
+    """The offset of a run's middle beside a drift that counts from its start; a drift made of noise."""
+    loose = jaxekf.get_model("loose")
+    able = loose.parameters._replace(calibration=Drifting(0.0, 0.0))
+    model = replace(loose, parameters=able)
+    run = align_run(planted(3, 60.0, latency_s=0.2, drift=100e-6))
+    assert "drifts against the IMU's by" in run.notes[0]
+    told = calibration_for(model, together([run]))[0].calibration
+    assert told.clock_drift == pytest.approx(-100e-6, abs=25e-6)
+    assert told.clock_offset == pytest.approx(-(0.2 - 30.0 * 100e-6), abs=1e-3)
+    assert told.clock_offset == pytest.approx(-0.2 - 30.0 * told.clock_drift, abs=5e-4)
+    steady = align_run(planted(3, 60.0, latency_s=0.2))
+    told = calibration_for(model, together([steady]))[0].calibration
+    assert told.clock_drift == 0.0
+    assert told.clock_offset == pytest.approx(-steady.tracker.latency_s, abs=1e-12)

@@ -83,7 +83,8 @@ def _print(found: list[RunAlignment], mean: Together) -> None:
     if len(found) > 1:
         size, axis, sigma = _turn(mean.alignment, mean.alignment_cov)
         latency = _pm(1e3 * mean.latency_s, 1e3 * mean.latency_sigma_s)
-        rows.append(["mean", "tracker", latency, "", _pm(size, sigma), axis, ""])
+        drift = _drift(mean.drift, mean.drift_sigma)
+        rows.append(["mean", "tracker", latency, drift, _pm(size, sigma), axis, ""])
     columns = [
         "run",
         "stream",
@@ -104,14 +105,11 @@ def _print(found: list[RunAlignment], mean: Together) -> None:
 
 def _row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
     size, axis, sigma = _turn(made.alignment, made.alignment_cov)
-    drift = "–"
-    if made.drift == made.drift:
-        drift = _pm(1e6 * made.drift, 1e6 * made.drift_sigma)
     return [
         run,
         stream,
         _pm(1e3 * made.latency_s, 1e3 * made.latency_sigma_s),
-        drift,
+        _drift(made.drift, made.drift_sigma),
         _pm(size, sigma),
         axis,
         ", ".join(f"{value:+.3f}" for value in np.rad2deg(made.bias)),
@@ -124,6 +122,11 @@ def _turn(alignment: Floats, cov: Floats) -> tuple[float, str, float]:
     axis = alignment / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
     sigma = float(np.rad2deg(np.sqrt(axis @ cov @ axis)))
     return float(np.rad2deg(size)), ", ".join(f"{value:+.2f}" for value in axis), sigma
+
+
+def _drift(drift: float, sigma: float) -> str:
+    """In parts per million; a dash where the run is too short to tell."""
+    return "–" if drift != drift else _pm(1e6 * drift, 1e6 * sigma)
 
 
 def _pm(value: float, sigma: float) -> str:
@@ -164,4 +167,7 @@ def _together(mean: Together) -> dict[str, Any]:
         "alignment_sigma_deg": np.rad2deg(np.sqrt(np.diagonal(mean.alignment_cov))).tolist(),
         "alignment_chi2": mean.alignment_chi2,
         "alignment_p": mean.alignment_p,
+        "drift": mean.drift,
+        "drift_sigma": mean.drift_sigma,
+        "start_latency_s": mean.start_latency_s,
     }

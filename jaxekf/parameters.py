@@ -81,17 +81,39 @@ def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str
 
     ``value_deg`` beside a value in radians is for reading only.
     """
-    check(params)
-    document = to_document(model, params, origin)
-    head = {key: document[key] for key in ("schema_version", "model", "origin")}
-    noise = head | {"noise": document["noise"], "initial": document["initial"]}
-    write_whole(Path(path) / "noise.toml", tomli_w.dumps(noise))
-    file = Path(path) / "calibration.toml"
-    if document["calibration"]:
-        write_whole(file, tomli_w.dumps(head | {"calibration": document["calibration"]}))
+    save_noise(path, model, params, origin)
+    if leaf_names(params.calibration):
+        save_calibration(path, model, params, origin)
     else:
         # What an earlier model left there must not be read beside this one's noise.
-        file.unlink(missing_ok=True)
+        (Path(path) / "calibration.toml").unlink(missing_ok=True)
+
+
+def save_noise(
+    path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]
+) -> None:
+    """Write `noise.toml` alone; see `save`."""
+    check(params)
+    _write(Path(path) / "noise.toml", model, params, origin, ("noise", "initial"))
+
+
+def save_calibration(
+    path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]
+) -> None:
+    """Write `calibration.toml` alone; see `save`."""
+    _write(Path(path) / "calibration.toml", model, params, origin, ("calibration",))
+
+
+def _write(
+    file: Path,
+    model: Model,
+    params: Parameters,
+    origin: Mapping[str, Any],
+    sections: tuple[str, ...],
+) -> None:
+    document = to_document(model, params, origin)
+    kept = ("schema_version", "model", "origin", *sections)
+    write_whole(file, tomli_w.dumps({key: document[key] for key in kept}))
 
 
 def load(model: Model, *paths: Path | str) -> Parameters:

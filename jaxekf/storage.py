@@ -36,7 +36,7 @@ from jaxekf.tables import (
     write_sheet,
 )
 
-__all__ = ["SCHEMA_VERSION", "joint_attitude", "load", "save"]
+__all__ = ["SCHEMA_VERSION", "joint_attitude", "load", "load_imu", "save"]
 
 
 def load(path: Path | str) -> Recording:
@@ -63,6 +63,12 @@ def load(path: Path | str) -> Recording:
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
     return Recording(name, **read, info=info, path=folder)
+
+
+def load_imu(path: Path | str) -> Recording:
+    """An IMU alone, from a CSV file with the columns of `imu.csv`."""
+    file = Path(path)
+    return Recording(file.stem, imu=_read_imu(read_table(file), {}), path=file)
 
 
 def save(

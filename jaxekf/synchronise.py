@@ -18,6 +18,8 @@ _LARGEST_S = 0.5
 _LONGEST_GAP = 2.5
 """Periods between two samples over which a turn still counts."""
 _FEWEST = 50
+_COARSE = 6000
+"""Turns among which the latency is searched for."""
 _OUTLYING = 5.0
 _ROUNDS = 12
 _CORRELATED = 8
@@ -57,8 +59,8 @@ class _Turns(NamedTuple):
 def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
     """Latency of the tracker against the IMU, up to half a second, and how their frames lie.
 
-    Raises `RecordingError` where there are too few turns, or so little motion that the latency is not known
-    to 5 ms: it is then refused, not guessed.
+    Raises `RecordingError` where there are too few turns, so little motion that the latency is not known to
+    5 ms, or where it would be half a second or more: it is then refused, not guessed.
     """
     turns = _turns(optical, imu)
     if len(turns.turn) < _FEWEST:
@@ -74,6 +76,13 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
     integral = CubicHermiteSpline(seconds, angle, imu.gyroscope)
     latency = _coarse(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
     found = _refined(turns, integral, latency)
+    if abs(found.latency_s) >= _LARGEST_S:
+        raise RecordingError(
+            str(place),
+            f"tracker and gyroscope that agree best {found.latency_s:+.2f} s apart",
+            f"clocks within {_LARGEST_S:g} s of each other",
+            "shifting the times of one of them first",
+        )
     if not found.latency_sigma_s <= _LARGEST_SIGMA_S:
         raise RecordingError(
             str(place),
@@ -98,13 +107,15 @@ def _turns(optical: Optical, imu: Imu) -> _Turns:
 
 def _coarse(turns: _Turns, integral: CubicHermiteSpline, period_s: float) -> float:
     """The latency at which both turn alike fast, whatever their frames: the best correlation."""
+    # Of a long run some are enough to tell so roughly.
+    turns = _Turns(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
     span = turns.end - turns.begin
     speed = np.linalg.norm(turns.turn, axis=1) / span
     # A wrong pose is a spike of speed, which would outweigh all motion.
     speed = np.minimum(speed, np.quantile(speed, 0.98))
     speed = speed - speed.mean()
     best, latency = -np.inf, 0.0
-    step = max(0.002, min(0.5 * period_s, 0.02))
+    step = max(0.01, min(0.5 * period_s, 0.02))
     for shift in np.arange(-_LARGEST_S, _LARGEST_S + step, step):
         said = integral(turns.end - shift) - integral(turns.begin - shift)
         other = np.linalg.norm(said, axis=1) / span

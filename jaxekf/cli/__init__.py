@@ -1,9 +1,11 @@
-"""The command line: simulate, estimate, tune, plot, report, demo."""
+"""The command line: simulate, allan, align, estimate, tune, plot, report, demo."""
 
 import click
 import jax
 
 from jaxekf import __version__
+from jaxekf.cli.align import align
+from jaxekf.cli.allan import allan
 from jaxekf.cli.console import Commands
 from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
@@ -25,5 +27,5 @@ def main() -> None:
     prepare()
 
 
-for command in (simulate, estimate, tune, plot, report, demo):
+for command in (simulate, allan, align, estimate, tune, plot, report, demo):
     main.add_command(command)

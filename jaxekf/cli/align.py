@@ -1,0 +1,173 @@
+"""`jaxekf align`: clock and frame of the tracker against the IMU."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from jaxekf import parameters
+from jaxekf.alignment import (
+    RunAlignment,
+    Together,
+    align_run,
+    calibration_for,
+    together,
+)
+from jaxekf.attitude_match import AttitudeMatch
+from jaxekf.cli.console import (
+    json_option,
+    model_option,
+    note,
+    overwrite_option,
+    print_json,
+    print_table,
+)
+from jaxekf.cli.estimate import load_runs
+from jaxekf.files import check_output, finite_or_null, whole_folder
+from jaxekf.models import get_model
+from jaxekf.recording import Floats
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@model_option
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=Path("aligned"), show_default=True
+)
+@overwrite_option
+@json_option
+def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_json: bool) -> None:
+    """Clock offset and alignment between tracker and IMU, from the angular rates of RUNS.
+
+    Latency: seconds that the tracker's samples are older than stamped, in the middle of the run, beyond
+    what the recording states; drift: how fast it grows. Alignment: how the tracked frame lies in the
+    IMU's. All runs together give calibration.toml for the model; align.json holds everything.
+    """
+    check_output(output, "align.json", overwrite=overwrite)
+    chosen = get_model(model)
+    found = [align_run(recording) for recording in load_runs(runs)]
+    mean = together(found)
+    params, sentences = calibration_for(chosen, mean)
+    for run in found:
+        for text in run.notes:
+            note(f"{run.run}: {text}")
+    for text in (*mean.sentences(), *sentences):
+        note(text)
+    document = {
+        "model": chosen.name,
+        "runs": [_run(run) for run in found],
+        "together": _together(mean),
+        "calibration": parameters.to_document(chosen, params, {})["calibration"],
+        "notes": [*mean.sentences(), *sentences],
+    }
+    with whole_folder(output, "align.json", overwrite=overwrite) as folder:
+        origin = {"aligned": [run.run for run in found]}
+        parameters.save_calibration(folder, chosen, params, origin)
+        text = json.dumps(finite_or_null(document), indent=2)
+        (folder / "align.json").write_text(text + "\n", "utf-8")
+    note(f"wrote {output / 'calibration.toml'} for {chosen.name}")
+    if as_json:
+        print_json(document | {"output": str(output)})
+        return
+    _print(found, mean)
+
+
+def _print(found: list[RunAlignment], mean: Together) -> None:
+    rows = []
+    for run in found:
+        rows.append(_row(run.run, "tracker", run.tracker))
+        if run.encoder is not None:
+            rows.append(_row(run.run, "encoder", run.encoder))
+    if len(found) > 1:
+        size, axis, sigma = _turn(mean.alignment, mean.alignment_cov)
+        latency = _pm(1e3 * mean.latency_s, 1e3 * mean.latency_sigma_s)
+        drift = _drift(mean.drift, mean.drift_sigma)
+        rows.append(["mean", "tracker", latency, drift, _pm(size, sigma), axis, ""])
+    columns = [
+        "run",
+        "stream",
+        "latency\n(ms)",
+        "drift\n(ppm)",
+        "alignment\n(deg)",
+        "about\n(x, y, z)",
+        "gyroscope bias\n(deg/s)",
+    ]
+    print_table("Against the IMU, with standard deviations", columns, rows)
+    if len(found) > 1:
+        click.echo(
+            f"Do the runs agree? latency: chi-square {mean.latency_chi2:.1f} of {mean.runs - 1},"
+            f" p = {mean.latency_p:.2g}; alignment: {mean.alignment_chi2:.1f} of {3 * mean.runs - 3},"
+            f" p = {mean.alignment_p:.2g}"
+        )
+
+
+def _row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
+    size, axis, sigma = _turn(made.alignment, made.alignment_cov)
+    return [
+        run,
+        stream,
+        _pm(1e3 * made.latency_s, 1e3 * made.latency_sigma_s),
+        _drift(made.drift, made.drift_sigma),
+        _pm(size, sigma),
+        axis,
+        ", ".join(f"{value:+.3f}" for value in np.rad2deg(made.bias)),
+    ]
+
+
+def _turn(alignment: Floats, cov: Floats) -> tuple[float, str, float]:
+    """Size in degrees, axis in words, and the deviation about that axis in degrees."""
+    size = float(np.linalg.norm(alignment))
+    axis = alignment / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
+    sigma = float(np.rad2deg(np.sqrt(axis @ cov @ axis)))
+    return float(np.rad2deg(size)), ", ".join(f"{value:+.2f}" for value in axis), sigma
+
+
+def _drift(drift: float, sigma: float) -> str:
+    """In parts per million; a dash where the run is too short to tell."""
+    return "–" if drift != drift else _pm(1e6 * drift, 1e6 * sigma)
+
+
+def _pm(value: float, sigma: float) -> str:
+    """A value with its deviation, to the deviation's second digit."""
+    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def _run(run: RunAlignment) -> dict[str, Any]:
+    document: dict[str, Any] = {"run": run.run, "tracker": _aligned(run.tracker)}
+    if run.encoder is not None:
+        document["encoder"] = _aligned(run.encoder)
+    return document | {"notes": list(run.notes)}
+
+
+def _aligned(made: AttitudeMatch) -> dict[str, Any]:
+    return {
+        "latency_s": made.latency_s,
+        "latency_sigma_s": made.latency_sigma_s,
+        "middle_s": made.middle_s,
+        "duration_s": made.duration_s,
+        "drift": made.drift,
+        "drift_sigma": made.drift_sigma,
+        "alignment_deg": np.rad2deg(made.alignment).tolist(),
+        "alignment_sigma_deg": np.rad2deg(np.sqrt(np.diagonal(made.alignment_cov))).tolist(),
+        "bias_deg_s": np.rad2deg(made.bias).tolist(),
+        "scatter_deg": float(np.rad2deg(made.scatter)),
+    }
+
+
+def _together(mean: Together) -> dict[str, Any]:
+    return {
+        "latency_s": mean.latency_s,
+        "latency_sigma_s": mean.latency_sigma_s,
+        "latency_chi2": mean.latency_chi2,
+        "latency_p": mean.latency_p,
+        "alignment_deg": np.rad2deg(mean.alignment).tolist(),
+        "alignment_sigma_deg": np.rad2deg(np.sqrt(np.diagonal(mean.alignment_cov))).tolist(),
+        "alignment_chi2": mean.alignment_chi2,
+        "alignment_p": mean.alignment_p,
+        "drift": mean.drift,
+        "drift_sigma": mean.drift_sigma,
+        "start_latency_s": mean.start_latency_s,
+    }

@@ -5,7 +5,9 @@
 FOLDER holds BROAD's MATLAB files. Each trial keeps its real gyroscope; its motion-capture attitude is
 the truth, and a decimated, noisy, interrupted copy of it is the tracker. From hand-set noise, Q and R
 are tuned by gradient on the training trials together with the gyroscope's clock offset and matrix
-(`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed.
+(`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed. With
+`--calibrate` the objective is the likelihood of what was measured, with priors, and each trial has a
+matrix of its own, that of a test trial found from its innovations alone: its truth is for the score only.
 
 The last line printed is JSON with the attitude RMSE in degrees of each test trial.
 """
@@ -15,6 +17,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -50,14 +53,29 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--test", nargs="+", required=True, metavar="TRIAL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, default=20)
-    parser.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
+    which.add_argument(
+        "--calibrate", action="store_true", help="by likelihood, a gyroscope matrix for each trial"
+    )
     return parser.parse_args()
 
 
 def say_progress(step: tuning.Iteration, total: int) -> None:
     if sys.stderr.isatty():
-        rms = step.training**0.5
-        print(f"\r  step {step.number + 1}/{total}: {rms:.4f} deg", end="", file=sys.stderr)
+        print(f"\r  step {step.number + 1}/{total}: {step.training:.5f}", end="", file=sys.stderr)
+
+
+def asked(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What is tuned, and by what."""
+    found: dict[str, Any] = {"free": ["noise", *CALIBRATION], "iterations": arguments.iterations}
+    if arguments.noise_only:
+        found["free"] = ["noise"]
+    if arguments.calibrate:
+        matrix = tuning.Free("calibration.gyroscope_matrix", each_run=True, prior=0.02)
+        found |= {"free": ["noise", "calibration.clock_offset", matrix], "objective": "map"}
+        found["iterations"] = max(arguments.iterations, 40)
+    return found
 
 
 def main() -> None:
@@ -67,14 +85,10 @@ def main() -> None:
     training = load(arguments.folder, arguments.train, arguments.seed)
     testing = load(arguments.folder, arguments.test, arguments.seed)
     start = hand_set()
-    tuned = tuning.tune(
-        training,
-        start=start,
-        free=["noise"] if arguments.noise_only else ["noise", *CALIBRATION],
-        iterations=arguments.iterations,
-        progress=say_progress,
-    )
-    compared = tuning.compare("loose", testing, {"initial": start, "tuned": tuned.params})
+    tuned = tuning.tune(training, start=start, progress=say_progress, **asked(arguments))
+    own = tuning.fit_runs(testing, tuned)
+    params = [own[trial.name] for trial in testing]
+    compared = tuning.compare("loose", testing, {"initial": start, "tuned": params})
     noise, calibration = tuned.params.noise, tuned.params.calibration
     print(f"tuned in {len(tuned.history)} steps: {tuned.stopped}")
     for name, unit in (
@@ -89,7 +103,7 @@ def main() -> None:
         key: [row.attitude_rmse_deg for row in compared.rows if row.variant == variant]
         for variant, key in columns.items()
     }
-    smoothed = jaxekf.estimate_many(testing, "loose", tuned.params, smooth=True)
+    smoothed = jaxekf.estimate_many(testing, "loose", params, smooth=True)
     summary["smoothed_deg"] = [
         jaxekf.score(made, run).attitude_rmse_deg
         for made, run in zip(smoothed, testing, strict=True)
@@ -101,6 +115,9 @@ def main() -> None:
         values = [float(np.asarray(summary[key])[i]) for key in columns.values()]
         values += [checks[i].nis, checks[i].nees]
         print(f"{trial:>12}" + "".join(f"{value:>12.3f}" for value in values))
+    summary["nees"] = [row.nees for row in checks]
+    summary["optical_deg"] = float(np.rad2deg(noise.optical))
+    summary["clock_offset_ms"] = 1e3 * float(calibration.clock_offset)
     summary["trials"] = arguments.test
     summary["seconds"] = round(time.perf_counter() - began, 1)
     print(json.dumps(summary))

@@ -16,12 +16,14 @@ from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Flags, Floats
 from tuning.data import Data
-from tuning.information import of_runs
+from tuning.information import information, of_runs
 from tuning.noise import Layout
 from tuning.objectives import Objective, count, evaluate_each, visible_rows, weights_of
 from tuning.walk import Walk
 
 _IMPROVEMENT = 1e-4
+_LEAST_EVIDENCE = 3e-3
+"""A gain of log-likelihood, of all rows together, that is not worth another step."""
 _OWN_STEPS = 2
 """Steps of Fisher scoring on a held-out run's own parameters each time it judges."""
 
@@ -89,6 +91,8 @@ class Descent:
     iterations: int
     """At most."""
     optimiser: optax.GradientTransformation | None = None
+    fisher: bool = False
+    """Whether steps are those of Fisher scoring; for an objective of likelihood and prior."""
     keep: Callable[[dict[str, Any]], None] | None = None
     """Called after each step with all that the loop goes on from."""
     fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
@@ -103,7 +107,7 @@ class Descent:
         self.start = on_host(self.layout.to_free(self.base))
         if not self.fixed.size:
             self.fixed = np.zeros(len(self.start), bool)
-        self.walk = Walk(jnp.asarray(self.start), self.optimiser)
+        self.walk = self._walk(self.start)
         self.since = 0
         self.own_free: Floats | None = None
         self.fallback: Best | None = None
@@ -119,9 +123,29 @@ class Descent:
         return total_counts(self.validation or (), self.objective)
 
     @cached_property
-    def _prior_weight(self) -> float:
-        rows = sum(int(visible_rows(data)) for data in self.training)
-        return self.objective.prior / max(rows, 1)
+    def _rows(self) -> int:
+        """Measured rows of the training runs."""
+        return max(sum(int(visible_rows(data)) for data in self.training), 1)
+
+    def _walk(self, free: Any) -> Walk:
+        # Of a likelihood a small part of the mean would be a large part of what tells parameters apart.
+        likely = self.objective.likelihood + self.objective.truth
+        least = _LEAST_EVIDENCE * likely / self._rows if likely else None
+        direction = self._scoring if self.fisher else None
+        return Walk(jnp.asarray(free), self.optimiser, least, direction)
+
+    def _scoring(self, free: Array, gradient: Array) -> Array:
+        """The step of Fisher scoring: down the gradient by the inverse of the expected curvature."""
+        known = information(self.model, self.layout, free, self.base, self.training)
+        curved = self.objective.likelihood * known.matrix
+        curved = curved + self.objective.prior * np.diag(self.layout.prior**-2.0)
+        # Where nothing is known, and no prior counts, a step is short rather than endless.
+        curved = curved + np.diag(1e-3 * self.layout.prior**-2.0)
+        moving = np.flatnonzero(~self.fixed)
+        step = np.zeros(len(gradient))
+        down = -self._rows * np.asarray(gradient)[moving]
+        step[moving] = np.linalg.solve(curved[np.ix_(moving, moving)], down)
+        return jnp.asarray(step)
 
     def value_and_gradient(self, free: Any) -> tuple[float, Array]:
         """The objective of the training runs, prior included."""
@@ -135,10 +159,11 @@ class Descent:
         self.evaluations += 1
         gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
         off = (plain - self.start) / self.layout.prior
-        gradient = gradient + self._prior_weight * off / self.layout.prior
+        weight = self.objective.prior / self._rows
+        gradient = gradient + weight * off / self.layout.prior
         gradient = np.where(self.fixed, 0.0, gradient)
         value = sum(float(value) for value, _ in found)
-        return value + 0.5 * self._prior_weight * float(off @ off), jnp.asarray(gradient)
+        return value + 0.5 * weight * float(off @ off), jnp.asarray(gradient)
 
     def validation_value(self, free: Any) -> float:
         """The objective of the validation runs; their own parameters come from their innovations."""
@@ -186,7 +211,7 @@ class Descent:
         assert self.best is not None
         self.fixed = fixed
         free = np.where(fixed, self.start, on_host(self.best.free))
-        self.walk = Walk(jnp.asarray(free), self.optimiser)
+        self.walk = self._walk(free)
         self.fallback = self.best._replace(free=free)
         self.best, self.rounds, self.since = None, self.rounds + 1, len(self.history)
         # Enough to come back from the start of a few numbers.
@@ -220,7 +245,8 @@ class Descent:
         judged = self._judged(step)
         before = float("inf") if self.best is None else self._judged(self.best.step)
         if finite and judged < before:
-            if judged < before - _IMPROVEMENT * abs(judged):
+            least = self.walk.least
+            if judged < before - (_IMPROVEMENT * abs(judged) if least is None else least):
                 self.since = step.number
             self.best = Best(on_host(self.walk.candidate), step)
         if self.best is None:

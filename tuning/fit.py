@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -128,7 +128,7 @@ def tune(
     rescale: bool | None = None,
     smooth: bool = False,
     judge: bool = False,
-    optimiser: optax.GradientTransformation | None = None,
+    optimiser: optax.GradientTransformation | Literal["lbfgs", "fisher"] = "lbfgs",
     checkpoint: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Tuned:
@@ -138,7 +138,8 @@ def tune(
     `Free` says more: a prior, bounds, and whether each run has its own. ``truth`` frees the encoder's
     clock and frames (`TruthFrame`). `axes` gives what is free one deviation for all axes (`tied`), one for
     `each`, or a `full` matrix; None leaves it as the start has it. With `smooth` errors are those of the
-    smoothed estimate. L-BFGS is the optimiser unless an optax one is given.
+    smoothed estimate. The optimiser is L-BFGS; ``fisher`` scoring for likelihood and `map`, which needs few
+    steps of two runs of the filter for each number: for up to some thirty; or any of optax.
 
     The best parameters so far are kept, by the validation runs where there are any; what these have of
     their own is found from their innovations, never from their truth. The tuner stops when they have not
@@ -172,9 +173,16 @@ def tune(
     options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
     training = prepare_groups(chosen, learnt, **options)
     held_out = prepare_groups(chosen, judging, **options) if validate else None
-    search = Descent(chosen, aim, where, base, training, held_out, iterations, optimiser)
+    own = None if isinstance(optimiser, str) else optimiser
+    fisher = optimiser == "fisher"
+    if fisher and (aim.errors or aim.truth):
+        raise TuningError(
+            f"got Fisher scoring for '{aim.describe()}', expected likelihood or map, whose curvature it"
+            " knows; take lbfgs"
+        )
+    search = Descent(chosen, aim, where, base, training, held_out, iterations, own, fisher=fisher)
     if checkpoint is not None:
-        asked = (_names(runs), _names(validate), iterations, patience, burn_in_s, judge)
+        asked = (_names(runs), _names(validate), iterations, patience, burn_in_s, judge, fisher)
         resume.attach(search, Path(checkpoint), repr(asked))
     known, stopped = _search(search, patience, judge, progress)
     assert search.best is not None

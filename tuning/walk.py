@@ -1,6 +1,6 @@
 """Where an optimiser stands and where it looks next, one evaluation at a time."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -20,10 +20,19 @@ class Walk:
 
     The default is L-BFGS with backtracking: the direction is optax's, a step is halved until the
     objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). An
-    optax optimiser of the caller's own is followed as it is, but for steps that are not finite.
+    optax optimiser of the caller's own is followed as it is, but for steps that are not finite; a
+    `direction` of where it stands and the gradient there takes the place of L-BFGS's. Two gains in a row
+    of less than `least`, by default a small part of the value, end it.
     """
 
-    def __init__(self, free: Array, optimiser: optax.GradientTransformation | None) -> None:
+    def __init__(
+        self,
+        free: Array,
+        optimiser: optax.GradientTransformation | None,
+        least: float | None = None,
+        direction: Callable[[Array, Array], Array] | None = None,
+    ) -> None:
+        self.least, self.direction = least, direction
         self.monotone = optimiser is None
         self.optimiser = optimiser or optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
         self.state = self.optimiser.init(free)
@@ -45,14 +54,18 @@ class Walk:
             self.change = (0.5 if finite else 0.25) * self.change
             self.candidate = self.stand + self.change
             return ""
-        small = self.value - value < _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
+        relative = _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
+        small = self.value - value < (relative if self.least is None else self.least)
         self.small_gains = self.small_gains + 1 if small and self.monotone else 0
         if self.small_gains >= 2:
             return "converged"
         self.rejections = 0
         self.stand, self.value, self.gradient = self.candidate, value, gradient
-        update, self.state = self.optimiser.update(gradient, self.state, self.stand)
-        self.change = jnp.asarray(update)
+        if self.direction is None:
+            update, self.state = self.optimiser.update(gradient, self.state, self.stand)
+            self.change = jnp.asarray(update)
+        else:
+            self.change = self.direction(self.stand, gradient)
         if self.monotone:
             if float(self.change @ gradient) >= 0.0:
                 self.change = -gradient

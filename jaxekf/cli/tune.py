@@ -1,7 +1,7 @@
 """`jaxekf tune`: noise, and calibration where asked, from recorded runs."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 import jax
@@ -69,6 +69,13 @@ from tuning.validation import as_dicts
     default=None,
     help="One deviation for all axes, one for each, or a full matrix.  [default: as the start has it]",
 )
+@click.option(
+    "--optimiser",
+    type=click.Choice(("lbfgs", "fisher")),
+    default="lbfgs",
+    show_default=True,
+    help="fisher scoring takes few steps to the end; for likelihood or map, and up to some thirty numbers.",
+)
 @click.option("--iterations", type=click.IntRange(1), default=60, show_default=True)
 @click.option(
     "--patience",
@@ -116,6 +123,7 @@ def tune(
     own: tuple[str, ...],
     spec: Path | None,
     axes: str | None,
+    optimiser: Literal["lbfgs", "fisher"],
     iterations: int,
     patience: int,
     burn_in: float,
@@ -151,6 +159,7 @@ def tune(
             free=asked or None,
             start=start,
             axes=axes,
+            optimiser=optimiser,
             iterations=iterations,
             patience=patience,
             burn_in_s=burn_in,

@@ -206,6 +206,19 @@ class Descent:
                 raise
             return "interrupted; the best so far is kept"
 
+    def warm(self, steps: int) -> None:
+        """Begin not at the start but where some steps of Fisher scoring on the likelihood lead from there.
+
+        Errors are flat, or rise, far from their minimum where the likelihood still falls towards its own.
+        """
+        aim = Objective(likelihood=1.0, prior=1.0)
+        given = (self.model, aim, self.layout, self.base, self.training, None, steps)
+        other = Descent(*given, fisher=True)
+        other.run(steps, None)
+        assert other.best is not None
+        self.walk = self._walk(other.best.free)
+        self.evaluations += other.evaluations
+
     def again(self, fixed: Flags) -> None:
         """Go on from the best with more numbers held at their start, judged anew."""
         assert self.best is not None

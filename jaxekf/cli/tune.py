@@ -104,6 +104,11 @@ from tuning.validation import as_dicts
     help="Tell what the data determine, with 95 % intervals; what they leave open stays at its start.",
 )
 @click.option(
+    "--warm",
+    is_flag=True,
+    help="Begin with some steps on the likelihood: for starts that are off by factors of ten and more.",
+)
+@click.option(
     "--state",
     type=click.Path(path_type=Path),
     help="Keep the state of the tuning in this file after each step; if it is there, go on from it.",
@@ -130,6 +135,7 @@ def tune(
     rescale: bool | None,
     smooth: bool,
     judge: bool,
+    warm: bool,
     state: Path | None,
     output: Path,
     overwrite: bool,
@@ -166,6 +172,7 @@ def tune(
             rescale=rescale,
             smooth=smooth,
             judge=judge,
+            warm=warm,
             checkpoint=state,
             progress=progress,
         )

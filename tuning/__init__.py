@@ -1,6 +1,7 @@
 """Noise covariances, and calibration, tuned by gradient against encoder truth or by likelihood."""
 
 from tuning.data import Data, prepare
+from tuning.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
 from tuning.descent import Iteration
 from tuning.fit import Tuned, fit_runs, tune
 from tuning.frame import TruthFrame
@@ -25,6 +26,7 @@ __all__ = [
     "Layout",
     "Objective",
     "Row",
+    "Searched",
     "TruthFrame",
     "Tuned",
     "attitude_error",
@@ -39,5 +41,7 @@ __all__ = [
     "read_free",
     "scaled",
     "tune",
+    "tune_by_coordinates",
+    "tune_by_nelder_mead",
     "with_axes",
 ]

@@ -1,7 +1,5 @@
 """Searches without gradients: they do what they are said to do, on the objective that the tuner has."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import tuning
 from jaxekf import get_model, simulate
 from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
-from tuning import derivative_free, objectives
+from tuning import derivative_free, descent, objectives
 
 
 def quadratic(x):
@@ -123,13 +121,15 @@ def test_both_lower_the_objective_of_the_tuner(runs, start, search, limit, objec
     assert first.evaluations == 1
     assert last.value == found.value < first.value - 0.02
     assert found.evaluations >= last.evaluations
-    data = tuning.prepare(get_model("loose"), runs, need_truth=False)
-    aim = objectives.parse(objective)
-    counted = dataclasses.replace(aim, prior=0.0)
-    again = float(tuning.evaluate(get_model("loose"), counted, found.params, data))
-    off = (found.free - np.asarray(found.layout.to_free(found.start))) / found.layout.prior
-    again += 0.5 * aim.prior * float(off @ off) / int(objectives.visible_rows(data))
-    assert found.value == pytest.approx(again, rel=1e-9)
+    given, where = (get_model("loose"), objectives.parse(objective)), found.layout
+    groups = tuning.data.prepare_groups(given[0], runs, need_truth=False)
+    tuner = descent.Descent(*given, where, found.start, groups, groups, iterations=1)
+    off = (found.free - np.asarray(where.to_free(found.start))) / where.prior
+    rows = int(objectives.visible_rows(groups[0]))
+    prior = 0.5 * given[1].prior * float(off @ off) / rows
+    assert found.value == pytest.approx(tuner.validation_value(found.free) + prior, rel=1e-12)
+    np.testing.assert_allclose(where.to_free(found.params), found.free, atol=1e-12)
+    assert (prior > 1e-7) == (objective == "map")
 
 
 @pytest.mark.parametrize(

@@ -199,10 +199,12 @@ def test_command_line(runs, start, found, tmp_path, monkeypatch, told):
         np.testing.assert_allclose(each, found.parameters["noise.optical"].each, rtol=1e-6)
         return
     assert before.index("Held out") < before.index("Parameters of the 3 folds")
+    words = [line.split() for line in before.splitlines()]
+    value = found.parameters["calibration.alignment"].mean[2]
+    told_of = next(row for row in words if row[:1] == ["calibration.alignment[2]"])
+    assert float(told_of[2]) == pytest.approx(np.rad2deg(value), rel=1e-3)
     for name in tuning.Spread._fields:
-        row = next(
-            line.split() for line in before.splitlines() if line.split()[:2] == [name, "tuned"]
-        )
+        row = next(row for row in words if row[:2] == [name, "tuned"])
         expected = getattr(found.spread()["tuned"], name)
         assert float(row[2]) == pytest.approx(expected, abs=6e-4)
 

@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any
 
 import click
+import numpy as np
 
 import tuning
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
@@ -36,11 +37,15 @@ def print_folds(found: tuning.CrossValidation) -> None:
 
     over_runs = {of: partial(told, of) for of in tuning.Spread._fields}
     print_comparison("Held out: each run by a tuning without it", found.rows, over_runs)
-    units, rows = units_by_name(found.folds[0].tuned.model), []
+    units = units_by_name(found.folds[0].tuned.model)
+    rows: list[list[Any]] = []
     for name, spread in found.parameters.items():
         turn, unit = in_degrees(units[name])
-        values: list[Any] = [spread.start, spread.mean, spread.deviation]
-        rows.append([name, *(short(turn(value)) for value in values), unit])
+        for at in np.ndindex(spread.start.shape):
+            if name.startswith("noise.") and len(at) == 2 and at[1] > at[0]:
+                continue  # above the diagonal of a factor there is nothing
+            entry = [short(turn(value[at])) for value in spread[:3]]
+            rows.append([name + (str(list(at)) if at else ""), *entry, unit])
     print_table(
         f"Parameters of the {len(found.folds)} folds",
         ["parameter", "start", "mean", "deviation", "unit"],

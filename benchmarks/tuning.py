@@ -173,14 +173,19 @@ def whole_tuning(count: int, duration_s: float) -> dict[str, Any]:
         )
         runs.append(run.replace(imu=late))
     free = ["noise", "calibration.clock_offset", "calibration.gyroscope_matrix"]
+    times: list[float] = []
     begin = time.perf_counter()
-    tuned = tuning.tune(runs, free=free)
+    tuned = tuning.tune(
+        runs, free=free, progress=lambda *_: times.append(time.perf_counter() - begin)
+    )
     spent = time.perf_counter() - begin
     found = tuned.params.calibration
     return {
         "runs": count,
         "seconds each": duration_s,
         "s": spent,
+        "s to the first iteration": times[0],
+        "s an iteration": (times[-1] - times[0]) / (len(times) - 1),
         "evaluations": tuned.evaluations,
         "stopped": tuned.stopped,
         "attitude RMSE, deg": tuned.best.training**0.5,

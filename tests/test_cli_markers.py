@@ -11,7 +11,7 @@ from click.testing import CliRunner
 import jaxekf
 from jaxekf import pose
 from jaxekf.cli import main
-from jaxekf.cli.tune import print_comparison
+from jaxekf.cli.comparison import print_comparison
 from jaxekf.datasets import demo
 from tuning import Row
 

@@ -87,11 +87,17 @@ def test_errors_are_as_large_as_the_bound(found):
     assert (0.92 if LONG else least) <= inside.mean() <= (0.98 if LONG else most)
 
 
-def test_held_out_errors_are_as_large_as_said(found):
-    """Would catch parameters that fit one run and mislead about the next (row 6)."""
-    count = 50 if LONG else SEEDS
-    runs = [planted(1000 + seed) for seed in range(count)]
-    params = [one.params for one in found[:count]]
+def test_held_out_errors_are_as_large_as_said():
+    """Would catch parameters that fit some runs and mislead about the next (row 6).
+
+    Of one short run a calibration is not known so well that its error could be left out; of eight it is.
+    """
+    learnt = [planted(seed) for seed in range(8)]
+    tuned = tuning.tune(
+        learnt, objective="map", free=FREE, start=off(), iterations=60, optimiser="fisher"
+    )
+    runs = [planted(1000 + seed) for seed in range(50 if LONG else 16)]
+    params = [tuned.params] * len(runs)
     squares, last = [], []
     for made, run in zip(jaxekf.estimate_many(runs, MODEL, params), runs, strict=True):
         told = encoder_at(run.need_encoder(), made.time_ns)
@@ -119,12 +125,11 @@ def test_what_no_motion_told_is_left_alone():
     assert untold <= set(one.open)
     assert "calibration.gyroscope_matrix[8]" in one.intervals
     np.testing.assert_allclose(one.params.calibration.gyroscope_matrix[:, :2], np.eye(3)[:, :2])
-    kept = tuning.tune(runs[:1], objective="map", free=FREE[:3], iterations=60)
     for leaf in jax.tree.leaves(one.params.noise):
         assert np.min(leaf) > 0.0
     scores = [
         jaxekf.score(jaxekf.estimate(runs[1], MODEL, p), runs[1]).attitude_rmse_deg
-        for p in (one.params, kept.params)
+        for p in (one.params, MODEL.parameters)
     ]
     assert scores[0] <= 1.01 * scores[1]
     where = noise.layout(MODEL, one.params, ["noise"])

@@ -1,8 +1,10 @@
 """Noise covariances, and calibration, tuned by gradient against encoder truth or by likelihood."""
 
 from tuning.data import Data, prepare
+from tuning.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
 from tuning.descent import Iteration
 from tuning.fit import Tuned, fit_runs, tune
+from tuning.folds import CrossValidation, Fold, ParameterSpread, Spread, cross_validate
 from tuning.frame import TruthFrame
 from tuning.information import Information
 from tuning.noise import Free, Layout, layout, scaled, with_axes
@@ -18,17 +20,23 @@ from tuning.validation import Comparison, Row, compare, mean_by_variant
 
 __all__ = [
     "Comparison",
+    "CrossValidation",
     "Data",
+    "Fold",
     "Free",
     "Information",
     "Iteration",
     "Layout",
     "Objective",
+    "ParameterSpread",
     "Row",
+    "Searched",
+    "Spread",
     "TruthFrame",
     "Tuned",
     "attitude_error",
     "compare",
+    "cross_validate",
     "evaluate",
     "fit_runs",
     "innovation_likelihood",
@@ -39,5 +47,7 @@ __all__ = [
     "read_free",
     "scaled",
     "tune",
+    "tune_by_coordinates",
+    "tune_by_nelder_mead",
     "with_axes",
 ]

@@ -28,6 +28,7 @@ from tuning.objectives import Objective, attitude_error, parse
 
 _ROUNDS = 2
 """Times that the search goes on after something was found to be open and was fixed at its start."""
+OPTIMISERS = ("lbfgs", "fisher")
 _OWN_FIT = 8
 _WARM_STEPS = 12
 
@@ -168,23 +169,14 @@ def tune(
     chosen = adapted(get_model(model), [*learnt, *judging])
     aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
     aim = replace(aim, smoothed=smooth or aim.smoothed)
-    base = as_arrays(chosen.parameters if start is None else start)
-    if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
-        base = base._replace(truth=no_correction())
-    if axes is not None:
-        base = with_axes(chosen, base, axes, free)
+    base = _base(chosen, start, free, axes)
     where = layout(chosen, base, free, len(learnt))
     _check_runs(runs, validate)
     options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
     training = prepare_groups(chosen, learnt, **options)
     held_out = prepare_groups(chosen, judging, **options) if validate else None
+    fisher = _is_fisher(optimiser, aim)
     own = None if isinstance(optimiser, str) else optimiser
-    fisher = optimiser == "fisher"
-    if fisher and (aim.errors or aim.truth):
-        raise TuningError(
-            f"got Fisher scoring for '{aim.describe()}', expected likelihood or map, whose curvature it"
-            " knows; take lbfgs"
-        )
     search = Descent(chosen, aim, where, base, training, held_out, iterations, own, fisher=fisher)
     if checkpoint is not None:
         asked = (
@@ -201,22 +193,63 @@ def tune(
     if warm and not search.history:
         search.warm(_WARM_STEPS)
     known, stopped = _search(search, patience, judge, progress)
-    assert search.best is not None
-    params = where.from_free(search.best.free, base)
-    scale = 1.0
-    likely = aim.likelihood or aim.truth
-    if rescale if rescale is not None else not likely and "attitude" in training[0].truth:
-        scale = consistency.scale(chosen, params, training, where)
-        params = scaled(params, scale)
+    if rescale is None:
+        rescale = not aim.likelihood and not aim.truth and "attitude" in training[0].truth
+    tuned = _told(search, known, stopped, _names(runs), _names(validate), rescale=rescale)
     if checkpoint is not None:
         Path(checkpoint).unlink(missing_ok=True)
-    names = _names(runs)
-    each = {name: where.one_run(params, i) for i, name in enumerate(names)} if where.own else {}
-    best = search.best.step
+    return tuned
+
+
+def _base(
+    model: Model,
+    start: Parameters | None,
+    free: Sequence[str | Free] | None,
+    axes: str | None,
+) -> Parameters:
+    """Where the search starts, in the shapes in which it is to go on."""
+    base = as_arrays(model.parameters if start is None else start)
+    if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
+        base = base._replace(truth=no_correction())
+    return base if axes is None else with_axes(model, base, axes, free)
+
+
+def _is_fisher(optimiser: Any, aim: Objective) -> bool:
+    if not isinstance(optimiser, str):
+        return False
+    if optimiser not in OPTIMISERS:
+        raise TuningError(
+            f"got the optimiser '{optimiser}', expected one of {OPTIMISERS} or one of optax; choose one"
+        )
+    if optimiser == "fisher" and (aim.errors or aim.truth):
+        raise TuningError(
+            f"got Fisher scoring for '{aim.describe()}', expected likelihood or map, whose curvature it"
+            " knows; take lbfgs"
+        )
+    return optimiser == "fisher"
+
+
+def _told(
+    search: Descent,
+    known: Information | None,
+    stopped: str,
+    runs: list[str],
+    validate: list[str],
+    *,
+    rescale: bool,
+) -> Tuned:
+    """What came out of a search."""
+    assert search.best is not None
+    where, best = search.layout, search.best.step
+    params, scale = where.from_free(search.best.free, search.base), 1.0
+    if rescale:
+        scale = consistency.scale(search.model, params, search.training, where)
+        params = scaled(params, scale)
+    each = {name: where.one_run(params, i) for i, name in enumerate(runs)} if where.own else {}
     origin = {
-        "runs": names,
-        "validation_runs": _names(validate),
-        "objective": aim.describe(),
+        "runs": runs,
+        "validation_runs": validate,
+        "objective": search.objective.describe(),
         "free": [leaf.name for leaf in where.leaves],
         "iterations": len(search.history),
         "best_iteration": best.number,
@@ -232,22 +265,22 @@ def tune(
     if validate:
         origin["validation_value"] = best.validation
     return Tuned(
-        chosen,
-        where.together(params)._replace(truth=()),
-        base,
-        aim,
-        best,
-        tuple(search.history),
-        stopped,
-        scale,
-        where,
-        origin,
-        {name: own._replace(truth=()) for name, own in each.items()},
-        params.truth or None,
-        np.asarray(search.best.free),
-        known,
-        search.fixed,
-        search.evaluations,
+        model=search.model,
+        params=where.together(params)._replace(truth=()),
+        start=search.base,
+        objective=search.objective,
+        best=best,
+        history=tuple(search.history),
+        stopped=stopped,
+        scale=scale,
+        layout=where,
+        origin=origin,
+        each={name: own._replace(truth=()) for name, own in each.items()},
+        truth=params.truth or None,
+        free=np.asarray(search.best.free),
+        information=known,
+        fixed=search.fixed,
+        evaluations=search.evaluations,
     )
 
 

@@ -40,14 +40,18 @@ def compare(
     model: str | Model,
     runs: Sequence[Run],
     variants: Mapping[str, Parameters | Sequence[Parameters]],
+    *,
+    smooth: bool = False,
 ) -> Comparison:
     """Estimate every run with every choice of parameters, one set or a list of each run's own; the first
-    rows hold the last tracker sample.
+    rows hold the last tracker sample. With `smooth` the estimates are the smoothed ones.
 
     The rate of `hold last` is the gyroscope's own; it has no covariance, so that NIS and NEES are NaN.
     """
     recordings = [run if isinstance(run, Recording) else storage.load(run) for run in runs]
-    estimates = {name: estimate_many(recordings, model, p) for name, p in variants.items()}
+    estimates = {
+        name: estimate_many(recordings, model, p, smooth=smooth) for name, p in variants.items()
+    }
     rows: list[Row] = []
     nan = float("nan")
     for i, recording in enumerate(recordings):

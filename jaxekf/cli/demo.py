@@ -8,9 +8,9 @@ import click
 import numpy as np
 
 import tuning
+from jaxekf.cli.comparison import print_comparison
 from jaxekf.cli.console import json_option, note, print_json, tuning_progress
 from jaxekf.cli.plot import draw
-from jaxekf.cli.tune import print_comparison
 from jaxekf.datasets import demo as runs
 from jaxekf.diagnostics import diagnose
 from jaxekf.files import check_output, whole_folder

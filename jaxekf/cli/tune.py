@@ -9,6 +9,7 @@ import numpy as np
 
 import tuning
 from jaxekf import parameters
+from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -20,6 +21,7 @@ from jaxekf.cli.console import (
     tuning_progress,
 )
 from jaxekf.cli.estimate import load_runs
+from jaxekf.cli.folds import folds_option, print_folds
 from jaxekf.files import check_output
 from jaxekf.model import Parameters
 from jaxekf.models import get_model
@@ -113,6 +115,7 @@ from tuning.validation import as_dicts
     type=click.Path(path_type=Path),
     help="Keep the state of the tuning in this file after each step; if it is there, go on from it.",
 )
+@folds_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
 )
@@ -137,13 +140,15 @@ def tune(
     judge: bool,
     warm: bool,
     state: Path | None,
+    folds: int | None,
     output: Path,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Tune on RUNS and write noise.toml and calibration.toml.
 
-    --noise gives the start; the model's defaults otherwise.
+    --noise gives the start; the model's defaults otherwise. --folds first shows how well such a tuning does
+    on runs that it has not seen.
     """
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
@@ -156,26 +161,30 @@ def tune(
         for run in training + held_out:
             if run.encoder is None:
                 note(f"run '{run.name}' has no encoder and does not count in the error")
+    options: dict[str, Any] = {
+        "validate": held_out,
+        "model": chosen,
+        "objective": aim,
+        "free": asked or None,
+        "start": start,
+        "axes": axes,
+        "optimiser": optimiser,
+        "iterations": iterations,
+        "patience": patience,
+        "burn_in_s": burn_in,
+        "rescale": rescale,
+        "smooth": smooth,
+        "judge": judge,
+        "warm": warm,
+    }
+    unseen = None
+    if folds is not None:
+        with tuning_progress(iterations) as progress:
+            unseen = tuning.cross_validate(training, folds or None, progress=progress, **options)
+        if not as_json:
+            print_folds(unseen)
     with tuning_progress(iterations) as progress:
-        tuned = tuning.tune(
-            training,
-            validate=held_out,
-            model=chosen,
-            objective=aim,
-            free=asked or None,
-            start=start,
-            axes=axes,
-            optimiser=optimiser,
-            iterations=iterations,
-            patience=patience,
-            burn_in_s=burn_in,
-            rescale=rescale,
-            smooth=smooth,
-            judge=judge,
-            warm=warm,
-            checkpoint=state,
-            progress=progress,
-        )
+        tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuned.save(output)
     note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
@@ -183,10 +192,11 @@ def tune(
     for label, more in tuned.open.items():
         note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
     scored = [run for run in held_out or training if run.encoder is not None]
-    rows = _compare(tuned, scored, start, bool(held_out)) if scored else []
+    rows = _compare(tuned, scored, start, bool(held_out), smooth) if scored else []
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
+        document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
     _print_noise(tuned)
@@ -201,11 +211,13 @@ def _compare(
     runs: list[Recording],
     start: Parameters,
     held_out: bool,
+    smooth: bool,
 ) -> list[tuning.Row]:
     """Start and tuned parameters beside each other; a held-out run's own are found without its truth."""
     found = tuning.fit_runs(runs, tuned) if held_out else {}
     own = [found.get(run.name, tuned.of_run(run)) for run in runs]
-    return tuning.compare(tuned.model, runs, {"start": start, "tuned": own}).rows
+    variants = {"start": start, "tuned": own}
+    return tuning.compare(tuned.model, runs, variants, smooth=smooth).rows
 
 
 def _known(tuned: tuning.Tuned) -> dict[str, Any]:
@@ -240,13 +252,7 @@ def _print_known(tuned: tuning.Tuned) -> None:
 
 
 def _print_noise(tuned: tuning.Tuned) -> None:
-    units = dict(
-        zip(
-            parameters.leaf_names(tuned.model.units),
-            jax.tree.leaves(tuned.model.units),
-            strict=True,
-        )
-    )
+    units = units_by_name(tuned.model)
     names = parameters.leaf_names(tuned.params)
     before = jax.tree.leaves(tuned.start)
     after = jax.tree.leaves(tuned.params)
@@ -254,35 +260,6 @@ def _print_noise(tuned: tuning.Tuned) -> None:
     for name, old, new in zip(names, before, after, strict=True):
         if np.array_equal(old, new):
             continue
-        unit = units[name]
-        turn = np.rad2deg if unit.startswith("rad") else np.asarray
-        shown = unit.replace("rad", "deg", 1)
-        rows.append([name, _short(turn(old)), _short(turn(new)), shown])
+        turn, shown = in_degrees(units[name])
+        rows.append([name, short(turn(old)), short(turn(new)), shown])
     print_table("Tuned parameters", ["parameter", "start", "tuned", "unit"], rows)
-
-
-def _short(value: object) -> str:
-    array = np.asarray(value, float)
-    if array.ndim == 0:
-        return f"{float(array):.5g}"
-    return np.array2string(array, precision=4, separator=" ").replace("\n", "")
-
-
-def print_comparison(title: str, rows: list[tuning.Row]) -> None:
-    """The table that sets variants beside each other, run by run and on average."""
-    columns = {
-        "attitude_rmse_deg": "attitude RMSE\n(deg)",
-        "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
-        "nis": "tracker\nNIS",
-        "nees": "NEES",
-    }
-    if any(row.position_rmse_mm == row.position_rmse_mm for row in rows):
-        columns |= {
-            "position_rmse_mm": "position RMSE\n(mm)",
-            "position_nees": "position\nNEES",
-        }
-    shown = [[row.run, row.variant, *(getattr(row, field) for field in columns)] for row in rows]
-    means = {field: tuning.mean_by_variant(rows, field) for field in columns}
-    for variant in dict.fromkeys(row.variant for row in rows):
-        shown.append(["mean", variant, *(means[field][variant] for field in columns)])
-    print_table(title, ["run", "noise", *columns.values()], shown)

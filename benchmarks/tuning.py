@@ -1,0 +1,214 @@
+"""Gradient search against searches without gradients: ``python benchmarks/tuning.py [--quick]``.
+
+Finds 18 numbers, the full 3 x 3 factors of the three noises of `loose`, on simulated runs whose noise is
+correlated between axes, from a start that is off by factors of 3 to 10. Work is counted in forward
+equivalents: evaluations of the objective, of which one with its gradient counts as many as it takes the
+time of, measured in the same process. Times a whole tuning of ten runs too. Prints tables and, last, one
+line of JSON.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+
+# This file has the name of the package that it measures, and its folder comes first.
+sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != Path(__file__).parent]
+sys.path.append(str(Path(__file__).parent))
+
+from clock import timed  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+import jaxekf  # noqa: E402
+import tuning  # noqa: E402
+from jaxekf import simulate  # noqa: E402
+from jaxekf.parameters import as_arrays  # noqa: E402
+from jaxekf.recording import Recording, from_scipy, to_scipy  # noqa: E402
+from tuning import descent  # noqa: E402
+
+GYROSCOPE_DEG = np.array([[0.05, 0.0, 0.0], [0.03, 0.06, 0.0], [-0.02, 0.01, 0.03]])
+"""Factor of the gyroscope's density, deg/s/sqrt(Hz)."""
+OPTICAL_DEG = np.array([[0.2, 0.0, 0.0], [0.15, 0.3, 0.0], [0.1, -0.1, 0.4]])
+"""Factor of the tracker's covariance, deg."""
+FACTORS = {"gyroscope": 10.0, "bias_walk": 3.0, "optical": 0.2}
+"""By which the start is off, of each axis's deviation."""
+SWEEPS = 20
+
+
+def correlated(seed: int, duration_s: float) -> Recording:
+    """A run whose noise is correlated between axes."""
+    grade = simulate.SensorGrade(gyroscope_deg=0.0, optical_deg=0.0)
+    motion = simulate.free_motion(seed, rest_s=0.5)
+    hidden = [(t, t + 1.0) for t in np.arange(5.0, duration_s, 8.0)]
+    run = simulate.recording(
+        f"run-{seed}", motion, seed=seed, duration_s=duration_s, grade=grade, occlusions=hidden
+    )
+    rng, imu, optical = np.random.default_rng([seed, 7]), run.need_imu(), run.need_optical()
+    white = rng.standard_normal(imu.gyroscope.shape) @ np.deg2rad(GYROSCOPE_DEG).T
+    turn = rng.standard_normal((len(optical.time_ns), 3)) @ np.deg2rad(OPTICAL_DEG).T
+    q = np.where(optical.valid[:, None], optical.q_ref_body, [1.0, 0.0, 0.0, 0.0])
+    return run.replace(
+        imu=replace(imu, gyroscope=imu.gyroscope + white * np.sqrt(grade.imu_hz)),
+        optical=replace(optical, q_ref_body=from_scipy(to_scipy(q) * Rotation.from_rotvec(turn))),
+    )
+
+
+def start_off(model: Any) -> Any:
+    """The planted deviations of each axis, off by `FACTORS`, without correlation."""
+    each = {
+        "gyroscope": np.sqrt(np.diag(GYROSCOPE_DEG @ GYROSCOPE_DEG.T)),
+        "bias_walk": np.full(3, simulate.SensorGrade().bias_walk_deg),
+        "optical": np.sqrt(np.diag(OPTICAL_DEG @ OPTICAL_DEG.T)),
+    }
+    noise = {name: np.deg2rad(FACTORS[name] * value) for name, value in each.items()}
+    base = as_arrays(model.parameters)
+    return as_arrays(base._replace(noise=base.noise._replace(**noise)))
+
+
+def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: float) -> float:
+    """How many times as long the objective takes with its gradient."""
+    aim = tuned.objective
+    groups = tuning.data.prepare_groups(model, runs, need_truth=aim.needs_truth)
+    counts = descent.total_counts(groups, aim)
+    given = model, aim, tuned.layout, np.asarray(tuned.layout.to_free(tuned.start)), tuned.start
+
+    def over(function: Any) -> float:
+        def all_groups() -> Any:
+            return [function(*given, data, counts) for data in groups]
+
+        return timed(all_groups, seconds=seconds)[1]
+
+    return over(descent._value_and_gradient) / over(descent._value)
+
+
+def race(runs: Sequence[Recording], objective: str, quick: bool) -> dict[str, Any]:
+    """The three searches from the same start: work to reach what coordinate search ends with."""
+    model = jaxekf.get_model("loose")
+    given: dict[str, Any] = {"model": model, "objective": objective, "axes": "full"}
+    given["start"] = start_off(model)
+    sweeps = 3 if quick else SWEEPS
+    coordinates = tuning.tune_by_coordinates(runs, sweeps=sweeps, **given)
+    limit = 3 * coordinates.evaluations
+    simplex = tuning.tune_by_nelder_mead(runs, evaluations=limit, **given)
+    tuned = tuning.tune(runs, iterations=20 if quick else 60, rescale=False, **given)
+    cost = ratio(model, runs, tuned, 1.0 if quick else 5.0)
+    aim = coordinates.value
+    steps = [i + 1 for i, step in enumerate(tuned.history) if step.training <= aim]
+    lower = [step.evaluations for step in simplex.history if step.value <= aim]
+    work = steps[0] * cost if steps else float("nan")
+    return {
+        "objective": objective,
+        "start": coordinates.history[0].value,
+        "gradient costs": cost,
+        "work to reach coordinate search's end": {
+            "coordinate search": coordinates.history[-1].evaluations,
+            "Nelder-Mead": lower[0] if lower else None,
+            "gradient": work,
+        },
+        "work in total": {
+            "coordinate search": coordinates.evaluations,
+            "Nelder-Mead": simplex.evaluations,
+            "gradient": tuned.evaluations * cost,
+        },
+        "final value": {
+            "coordinate search": coordinates.value,
+            "Nelder-Mead": simplex.value,
+            "gradient": tuned.best.training,
+        },
+        "gradient evaluations": tuned.evaluations,
+        "stopped": tuned.stopped,
+        "times fewer": coordinates.history[-1].evaluations / work,
+    }
+
+
+def show(found: dict[str, Any]) -> None:
+    """One objective as a table."""
+    title = (
+        f"{found['objective']}: {found['start']:.5g} at the start; value with gradient takes"
+        f" {found['gradient costs']:.2f} times a value"
+    )
+    print(title)
+    table = Table("", "work to reach", "work in total", "final value")
+    for name, value in found["final value"].items():
+        reach = found["work to reach coordinate search's end"][name]
+        table.add_row(
+            name,
+            "–" if reach is None or reach != reach else f"{reach:.0f}",
+            f"{found['work in total'][name]:.0f}",
+            f"{value:.6g}",
+        )
+    Console(width=100).print(table)
+    print(f"times fewer: {found['times fewer']:.1f}; {found['stopped']}", flush=True)
+
+
+def whole_tuning(count: int, duration_s: float) -> dict[str, Any]:
+    """Seconds of a tuning of noise and calibration from runs in memory, compiling included."""
+    grade = simulate.SensorGrade(imu_hz=200.0)
+    matrix = np.array([[1.01, 0.004, -0.006], [-0.003, 0.99, 0.005], [0.002, -0.004, 1.005]])
+    runs = []
+    for seed in range(count):
+        motion = simulate.free_motion(seed, speed_deg=60.0)
+        run = simulate.recording(
+            f"run-{seed}", motion, seed=seed, duration_s=duration_s, grade=grade
+        )
+        imu = run.need_imu()
+        late = replace(
+            imu,
+            time_ns=imu.time_ns + 5_000_000,
+            gyroscope=imu.gyroscope @ np.linalg.inv(matrix).T,
+        )
+        runs.append(run.replace(imu=late))
+    free = ["noise", "calibration.clock_offset", "calibration.gyroscope_matrix"]
+    times: list[float] = []
+    begin = time.perf_counter()
+    tuned = tuning.tune(
+        runs, free=free, progress=lambda *_: times.append(time.perf_counter() - begin)
+    )
+    spent = time.perf_counter() - begin
+    found = tuned.params.calibration
+    return {
+        "runs": count,
+        "seconds each": duration_s,
+        "s": spent,
+        "s to the first iteration": times[0],
+        "s an iteration": (times[-1] - times[0]) / (len(times) - 1),
+        "evaluations": tuned.evaluations,
+        "stopped": tuned.stopped,
+        "attitude RMSE, deg": tuned.best.training**0.5,
+        "clock offset, ms": 1e3 * float(found.clock_offset),
+        "largest error of the matrix": float(np.abs(found.gyroscope_matrix - matrix).max()),
+    }
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs and searches")
+    quick = parser.parse_args().quick
+    # First, so that nothing of it is compiled yet.
+    whole = whole_tuning(*(2, 6.0) if quick else (10, 60.0))
+    print(f"a whole tuning: {whole}", flush=True)
+    runs = [correlated(seed, 6.0 if quick else 40.0) for seed in range(2 if quick else 8)]
+    races = []
+    for objective in ("attitude", "likelihood"):
+        races.append(race(runs, objective, quick))
+        show(races[-1])
+    print(json.dumps({"whole tuning": whole, "races": races, "cores": os.cpu_count()}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Tables of tunings: variants beside each other, and parameters with their units."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+import tuning
+from jaxekf.cli.console import print_table
+from jaxekf.model import Model
+from jaxekf.parameters import leaf_names
+
+
+def units_by_name(model: Model) -> dict[str, str]:
+    """The unit of each parameter."""
+    return dict(zip(leaf_names(model.units), jax.tree.leaves(model.units), strict=True))
+
+
+def in_degrees(unit: str) -> tuple[Callable[[Any], Any], str]:
+    """What turns a value into the unit that is shown, and that unit."""
+    turn = np.rad2deg if unit.startswith("rad") else np.asarray
+    return turn, unit.replace("rad", "deg", 1)
+
+
+def short(value: object) -> str:
+    """A number or an array in one line."""
+    array = np.asarray(value, float)
+    if array.ndim == 0:
+        return f"{float(array):.5g}"
+    return np.array2string(array, precision=4, separator=" ").replace("\n", "")
+
+
+def print_comparison(
+    title: str,
+    rows: Sequence[tuning.Row],
+    over_runs: Mapping[str, Callable[[str], dict[str, float]]] | None = None,
+) -> None:
+    """The table that sets variants beside each other, run by run and below that over the runs.
+
+    `over_runs` has, for each line of that kind, what tells one column by variant; their mean unless given.
+    """
+    columns = {
+        "attitude_rmse_deg": "attitude RMSE\n(deg)",
+        "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
+        "nis": "tracker\nNIS",
+        "nees": "NEES",
+    }
+    if any(row.position_rmse_mm == row.position_rmse_mm for row in rows):
+        columns |= {
+            "position_rmse_mm": "position RMSE\n(mm)",
+            "position_nees": "position\nNEES",
+        }
+    shown = [[row.run, row.variant, *(getattr(row, field) for field in columns)] for row in rows]
+    for name, told in (over_runs or {"mean": partial(tuning.mean_by_variant, rows)}).items():
+        values = {field: told(field) for field in columns}
+        for variant in dict.fromkeys(row.variant for row in rows):
+            shown.append([name, variant, *(values[field][variant] for field in columns)])
+    print_table(title, ["run", "noise", *columns.values()], shown)

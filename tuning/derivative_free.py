@@ -1,0 +1,276 @@
+"""What is done without a gradient, on the tuner's own objective: coordinate search and Nelder-Mead.
+
+Baselines to measure the tuner by, counted in evaluations of the objective: each filters all runs once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from jaxekf.errors import TuningError
+from jaxekf.estimation import Run, read, require_float64
+from jaxekf.model import Model, Parameters
+from jaxekf.models import adapted, get_model
+from jaxekf.parameters import as_arrays
+from jaxekf.recording import Flags, Floats
+from tuning import descent
+from tuning.data import prepare_groups
+from tuning.frame import no_correction
+from tuning.noise import Free, Layout, layout, with_axes
+from tuning.objectives import Objective, attitude_error, parse, visible_rows
+
+_FIRST_STEP = 0.1
+"""Of a value by itself, and of a number below the diagonal of a full matrix, which is one of its row's
+diagonal."""
+
+
+class Lowered(NamedTuple):
+    """Where a search first found a lower value."""
+
+    evaluations: int
+    """Made until then, this one included."""
+    value: float
+
+
+class Found(NamedTuple):
+    """What a search came to."""
+
+    best: Floats
+    """(n,)"""
+    value: float
+    history: tuple[Lowered, ...]
+    """From the start on, each lower than the one before."""
+    evaluations: int
+    """In total."""
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What came out of a tuning without gradients."""
+
+    params: Parameters
+    """The best; of what each run has of its own the mean. Covariances are not scaled to the errors."""
+    value: float
+    """The objective of `params`."""
+    history: tuple[Lowered, ...]
+    evaluations: int
+    """Of the objective, without a gradient."""
+    start: Parameters
+    layout: Layout
+    free: Floats
+    """(n,) the best free vector."""
+
+
+class _Counted:
+    """A function that keeps its lowest value; one that is not finite is as high as can be."""
+
+    def __init__(self, function: Callable[[Floats], float], start: Floats) -> None:
+        self.function = function
+        self.evaluations = 0
+        self.best, self.value = start, float("inf")
+        self.history: list[Lowered] = []
+        if not np.isfinite(self(start)):
+            raise TuningError(
+                "got an objective that is not finite at the start, expected a finite one; start from other"
+                " noise or check the data"
+            )
+
+    def __call__(self, at: Floats) -> float:
+        value = float(self.function(at))
+        self.evaluations += 1
+        value = value if np.isfinite(value) else float("inf")
+        if value < self.value:
+            self.best, self.value = at.copy(), value
+            self.history.append(Lowered(self.evaluations, value))
+        return value
+
+    def found(self) -> Found:
+        return Found(self.best, self.value, tuple(self.history), self.evaluations)
+
+
+def coordinate_search(
+    function: Callable[[Floats], float],
+    start: Floats,
+    *,
+    step: Floats,
+    relative: Flags,
+    sweeps: int = 20,
+    growth: float = 1.1,
+    shrinkage: float = 0.5,
+) -> Found:
+    """Lower a function of (n,) numbers by one number at a time (Abbeel et al. 2005; MATLAB's `tune`).
+
+    Each number in turn is tried with its step added, and if that does not lower the value, taken away; what
+    lowers it is kept. Then the number's step is multiplied by `growth`, or by `shrinkage` where neither
+    did. The step of a `relative` number is that share of its value. Raises `TuningError` where the value
+    at the start is not finite, and for less than one sweep.
+    """
+    if sweeps < 1:
+        raise TuningError(f"got {sweeps} sweeps, expected at least one; ask for more")
+    counted, steps = _Counted(function, np.asarray(start, float)), np.array(step, float)
+    for _ in range(sweeps):
+        for i in range(len(steps)):
+            before, lowest = counted.best, counted.value
+            change = steps[i] * (before[i] if relative[i] else 1.0)
+            for signed in (change, -change):
+                tried = before.copy()
+                tried[i] += signed
+                if counted(tried) < lowest:
+                    break
+            steps[i] *= growth if counted.value < lowest else shrinkage
+    return counted.found()
+
+
+def nelder_mead(
+    function: Callable[[Floats], float], start: Floats, *, step: Floats, evaluations: int
+) -> Found:
+    """Lower a function of (n,) numbers by SciPy's Nelder-Mead, its coefficients adapted to n.
+
+    The first simplex is the start and, for each number, the start with its step added. It ends after so
+    many evaluations, or when values and simplex agree within 1e-8. Raises `TuningError` where the value at
+    the start is not finite, and for fewer evaluations than the simplex has corners.
+    """
+    start, step = np.asarray(start, float), np.asarray(step, float)
+    if evaluations < len(start) + 2:
+        raise TuningError(
+            f"got {evaluations} evaluations for {len(start)} numbers, expected at least {len(start) + 2};"
+            " ask for more"
+        )
+    counted = _Counted(function, start)
+
+    options = {
+        "initial_simplex": np.vstack([start, start + np.diag(step)]),
+        # SciPy evaluates the start again, as the first corner.
+        "maxfev": evaluations - 1,
+        "adaptive": True,
+        "xatol": 1e-8,
+        "fatol": 1e-8,
+    }
+    minimize(counted, start, method="Nelder-Mead", options=options)
+    return counted.found()
+
+
+def tune_by_coordinates(
+    runs: Sequence[Run],
+    *,
+    model: str | Model = "loose",
+    objective: Objective | str | None = None,
+    free: Sequence[str | Free] | None = None,
+    start: Parameters | None = None,
+    axes: str | None = None,
+    burn_in_s: float = 0.0,
+    smooth: bool = False,
+    sweeps: int = 20,
+) -> Searched:
+    """Tune by `coordinate_search`; arguments, defaults and errors are those of `tune`.
+
+    Deviations start with steps of 10 % of their value, numbers below the diagonal of a full matrix with
+    10 % of their row's diagonal one, calibration with its natural unit (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
+    """
+    problem = _Problem(runs, model, objective, free, start, axes, burn_in_s, smooth)
+    relative = problem.relative
+
+    def natural(free: Floats) -> Floats:
+        return np.where(relative, np.exp(np.where(relative, free, 0.0)), free)
+
+    def back(values: Floats) -> Floats:
+        # A step of more than the whole value leads below zero: no deviation, and no finite objective.
+        admissible = np.where(relative & (values > 0.0), values, 1.0)
+        logs = np.where(values > 0.0, np.log(admissible), np.nan)
+        return np.where(relative, logs, values)
+
+    found = coordinate_search(
+        lambda values: problem.value(back(values)),
+        natural(problem.start),
+        step=problem.steps,
+        relative=relative,
+        sweeps=sweeps,
+    )
+    return problem.searched(found._replace(best=back(found.best)))
+
+
+def tune_by_nelder_mead(
+    runs: Sequence[Run],
+    *,
+    model: str | Model = "loose",
+    objective: Objective | str | None = None,
+    free: Sequence[str | Free] | None = None,
+    start: Parameters | None = None,
+    axes: str | None = None,
+    burn_in_s: float = 0.0,
+    smooth: bool = False,
+    evaluations: int = 1_000,
+) -> Searched:
+    """Tune by `nelder_mead` on the free vector, in which deviations are logarithms; arguments, defaults and
+    errors are those of `tune`. The steps of the first simplex are those of `tune_by_coordinates`."""
+    problem = _Problem(runs, model, objective, free, start, axes, burn_in_s, smooth)
+    found = nelder_mead(problem.value, problem.start, step=problem.steps, evaluations=evaluations)
+    return problem.searched(found)
+
+
+class _Problem:
+    """The tuner's objective as a function of the free vector, evaluated by the tuner's own program."""
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        model: str | Model,
+        objective: Objective | str | None,
+        free: Sequence[str | Free] | None,
+        start: Parameters | None,
+        axes: str | None,
+        burn_in_s: float,
+        smooth: bool,
+    ) -> None:
+        require_float64()
+        learnt = read(runs)
+        self.model = adapted(get_model(model), learnt)
+        aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
+        self.aim = replace(aim, smoothed=smooth or aim.smoothed)
+        base = as_arrays(self.model.parameters if start is None else start)
+        if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
+            base = base._replace(truth=no_correction())
+        self.base = base if axes is None else with_axes(self.model, base, axes, free)
+        self.layout = layout(self.model, self.base, free, len(learnt))
+        self.groups = prepare_groups(
+            self.model, learnt, burn_in_s=burn_in_s, need_truth=self.aim.needs_truth
+        )
+        self.counts = descent.total_counts(self.groups, self.aim)
+        self.start = descent.on_host(self.layout.to_free(self.base))
+        rows = sum(int(visible_rows(data)) for data in self.groups)
+        self.prior_weight = self.aim.prior / max(rows, 1)
+
+    @property
+    def relative(self) -> Flags:
+        """(n,) numbers that are logarithms."""
+        leaves = self.layout.leaves
+        return np.array([leaf.is_logarithm(i) for leaf in leaves for i in range(leaf.size)])
+
+    @property
+    def steps(self) -> Floats:
+        """(n,) first steps; a leaf of calibration has its natural unit as the unit of its free numbers."""
+        linear = [leaf.kind == "linear" for leaf in self.layout.leaves for _ in range(leaf.size)]
+        return np.where(linear, 1.0, _FIRST_STEP)
+
+    def value(self, free: Floats) -> float:
+        """The objective, prior included; one filtering of all runs."""
+        given = self.model, self.aim, self.layout, free, self.base
+        value = sum(float(descent._value(*given, data, self.counts)) for data in self.groups)
+        off = (free - self.start) / self.layout.prior
+        return value + 0.5 * self.prior_weight * float(off @ off)
+
+    def searched(self, found: Found) -> Searched:
+        params = self.layout.from_free(jnp.asarray(found.best), self.base)
+        return Searched(
+            self.layout.together(params)._replace(truth=()),
+            found.value,
+            found.history,
+            found.evaluations,
+            self.base,
+            self.layout,
+            found.best,
+        )

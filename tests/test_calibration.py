@@ -114,6 +114,21 @@ def test_held_out_runs_are_fitted_without_their_truth(runs, tuned, tmp_path):
     )
 
 
+def test_validation_runs_have_their_own(runs, tuned):
+    """Would catch a validation run judged with another run's parameters, or with none of its own."""
+    again = tuning.tune(
+        runs[:2], validate=runs[2:], objective="map", free=FREE, start=tuned.start, iterations=8
+    )
+    own = tuning.fit_runs(runs[2:], again)["run-2"]
+    held_out = tuning.prepare(MODEL, runs[2:])
+    aim = tuning.innovation_likelihood()
+    value = jit(lambda params, data: tuning.evaluate(MODEL, aim, params, data))
+    found = float(value(own, held_out))
+    assert again.best.validation == pytest.approx(found, abs=2e-3)
+    # A run's own alignment matters: with the others' the innovations are far less likely.
+    assert float(value(again.params, held_out)) > found + 0.05
+
+
 def test_parameters_of_each_run_estimate_it(runs, tuned):
     """Would catch estimates that mix up whose parameters are whose."""
     own = [tuned.of_run(run) for run in runs[:2]]
@@ -381,7 +396,7 @@ def test_command_line(runs, tuned, tmp_path):
         "--objective",
         "map",
         "--iterations",
-        "20",
+        "40",
         "--parameters",
         spec,
         "-o",

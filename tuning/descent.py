@@ -186,7 +186,7 @@ class Descent:
         total = sum(len(data.place) for data in self.validation)
         where = self.layout.for_runs_number(total)
         params = self.layout.together(self.layout.from_free(free, self.base))
-        plain = on_host(where.to_free(params))
+        plain = np.array(where.to_free(params))
         own = where.is_own
         if self.own_free is not None:
             plain[own] = self.own_free

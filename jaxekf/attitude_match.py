@@ -11,7 +11,7 @@ frame ``A_c`` leaves with the mean of each stretch. Residuals may be correlated 
 of a filtering tracker or a noisy gyroscope are: deviations are those of clusters.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,7 +190,7 @@ def _integral(known: Floats, rate: Floats, at: Floats) -> _Turned:
     matrix = turn.as_matrix()
     slabs = 0.5 * (matrix[1:] + matrix[:-1]) * step[:, None, None]
     swept = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
-    low = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(step) - 1)
+    low: Any = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(step) - 1)
     since = (at - known[low])[:, None]
     slope = (rate[low + 1] - rate[low]) / step[low, None]
     q = turn[low] * Rotation.from_rotvec((rate[low] + 0.5 * slope * since) * since)

@@ -12,7 +12,7 @@ Intervals are those of the profile likelihood, which needs no normal distributio
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.fft import dst
@@ -162,7 +162,7 @@ def _of_the_four_kinds(lines: _Lines) -> _Lines:
 def _lines(step: Floats, period_s: float) -> _Lines:
     """The spectrum of differences, in bins that are narrow beside any change of the terms."""
     count = len(step)
-    power = np.square(dst(step, type=1, norm="ortho"))
+    power = np.asarray(dst(step, type=1, norm="ortho")) ** 2
     number = np.arange(1, count + 1)
     size = 2.0 - 2.0 * np.cos(np.pi * number / (count + 1))
     shape = np.stack(
@@ -250,7 +250,8 @@ def _crossing(excess: Callable[[float], float], begin: float, factor: float) -> 
         outer = inner * factor
         if excess(outer) > 0.0:
             ends = sorted((np.log(inner), np.log(outer)))
-            return float(np.exp(brentq(lambda at: excess(float(np.exp(at))), *ends, xtol=1e-3)))
+            found: Any = brentq(lambda at: excess(float(np.exp(at))), *ends, xtol=1e-3)
+            return float(np.exp(found))
         inner = outer
     return inner
 

@@ -246,13 +246,22 @@ def test_the_encoder_is_found_where_it_lies(runs):
         objective="attitude",
         iterations=30,
         rescale=False,
+        judge=True,
     )
+    assert not found.open
+    assert not found.intervals
     assert float(found.truth.clock_offset) == pytest.approx(8e-3, abs=3e-4)
     # A small turn of the reference and one of the body are told apart by the motion.
     np.testing.assert_allclose(found.truth.reference, reference, atol=2.5e-3)
     np.testing.assert_allclose(found.truth.alignment, body, atol=2.5e-3)
     assert found.best.training**0.5 < 0.2
     np.testing.assert_array_equal(found.params.noise.optical, start.noise.optical)
+
+
+def test_a_free_encoder_needs_an_objective_that_looks_at_it(runs):
+    """Would catch an encoder that is tuned by what knows nothing of it."""
+    with pytest.raises(TuningError, match="compares with the encoder"):
+        tuning.tune(runs[:1], free=["truth"], objective="likelihood")
 
 
 def test_information_is_the_curvature(runs, tuned):

@@ -75,10 +75,9 @@ class Tuned:
         if self.information is None:
             return {}
         sigma = self.information.sigma(self.fixed)
-        told = zip(
-            self.layout.labels(), interval(self.layout, self.free, sigma), self.fixed, strict=True
-        )
-        return {label: ends for label, ends, fixed in told if not fixed}
+        told = zip(self.layout.labels(), interval(self.layout, self.free, sigma), strict=True)
+        unknown = self.fixed | self.layout.is_truth
+        return {label: ends for (label, ends), out in zip(told, unknown, strict=True) if not out}
 
     @property
     def open(self) -> dict[str, str]:
@@ -171,6 +170,11 @@ def tune(
     aim = replace(aim, smoothed=smooth or aim.smoothed)
     base = _base(chosen, start, free, axes)
     where = layout(chosen, base, free, len(learnt))
+    if where.is_truth.any() and not aim.needs_truth:
+        raise TuningError(
+            f"got the encoder's own clock or frame free for '{aim.describe()}', expected an objective that"
+            " compares with the encoder; add attitude or truth to it, or leave truth out"
+        )
     _check_runs(runs, validate)
     options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
     training = prepare_groups(chosen, learnt, **options)

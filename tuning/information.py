@@ -57,11 +57,12 @@ class Information:
         """(n,) what the measurements do not tell, `fixed` included.
 
         One after the other, the least known first: of two that only their sum is known of one is enough.
+        What belongs to the encoder is not among them: it is told by the errors, not by the measurements.
         """
         found = np.zeros(len(self.free), bool) if fixed is None else fixed.copy()
         prior = np.asarray(self.layout.prior)
         while not found.all():
-            left = self.sigma(found) / prior
+            left = np.where(self.layout.is_truth, 0.0, self.sigma(found) / prior)
             worst = int(np.argmax(left))
             if left[worst] <= OPEN:
                 break
@@ -162,7 +163,6 @@ _MORE = {
     "calibration.clock_drift": "recordings of ten minutes, with turning at both ends",
     "calibration.lever_arm": "turning about two axes or more while the tool moves little",
     "initial": "more runs, for each begins only once",
-    "truth": "an objective that compares with the encoder; the innovations know nothing of it",
 }
 
 

@@ -158,6 +158,13 @@ class Layout:
         return np.concatenate([np.full(leaf.size, leaf.runs > 0) for leaf in self.leaves])
 
     @property
+    def is_truth(self) -> Any:
+        """(n,) numbers that belong to the encoder."""
+        return np.concatenate(
+            [np.full(leaf.size, leaf.name.startswith("truth.")) for leaf in self.leaves]
+        )
+
+    @property
     def own_of_one_run(self) -> Any:
         """Which of the numbers that one run is filtered with are its own, as indices."""
         own = np.concatenate([np.full(leaf.each, leaf.runs > 0) for leaf in self.leaves])

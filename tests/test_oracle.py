@@ -25,7 +25,7 @@ def system_of(name):
     cov = {key: np.asarray(leaf @ leaf.T) for key, leaf in params.noise._asdict().items()}
     if name == "loose":
         calibration = params.calibration
-        turn = Rotation.from_rotvec(calibration.alignment).as_matrix()
+        turn = Rotation.from_rotvec(np.array(calibration.alignment)).as_matrix()
         matrix = turn @ np.asarray(calibration.gyroscope_matrix)
         return params, oracle.Loose(**cov, gyroscope_matrix=matrix)
     system = oracle.LooseRate if name == "loose_rate" else oracle.LooseAdditive

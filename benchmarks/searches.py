@@ -1,4 +1,4 @@
-"""Gradient search against searches without gradients: ``python benchmarks/tuning.py [--quick]``.
+"""Gradient search against searches without gradients: ``python benchmarks/searches.py [--quick]``.
 
 Finds 18 numbers, the full 3 x 3 factors of the three noises of `loose`, on simulated runs whose noise is
 correlated between axes, from a start that is off by factors of 3 to 10. Work is counted in forward
@@ -24,9 +24,7 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 
-# This file has the name of the package that it measures, and its folder comes first.
-sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != Path(__file__).parent]
-sys.path.append(str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent))
 
 from clock import timed  # noqa: E402
 from rich.console import Console  # noqa: E402

@@ -15,13 +15,12 @@ from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, read, require_float64
 from jaxekf.model import Model, Parameters
 from jaxekf.models import adapted, get_model
-from jaxekf.parameters import as_arrays
 from jaxekf.recording import Flags, Floats
-from tuning import descent
 from tuning.data import prepare_groups
-from tuning.frame import no_correction
-from tuning.noise import Free, Layout, layout, with_axes
-from tuning.objectives import Objective, attitude_error, parse, visible_rows
+from tuning.descent import Descent
+from tuning.fit import starting
+from tuning.noise import Free, Layout, layout
+from tuning.objectives import Objective, attitude_error, parse
 
 _FIRST_STEP = 0.1
 """Of a value by itself, and of a number below the diagonal of a full matrix, which is one of its row's
@@ -228,21 +227,16 @@ class _Problem:
     ) -> None:
         require_float64()
         learnt = read(runs)
-        self.model = adapted(get_model(model), learnt)
+        chosen = adapted(get_model(model), learnt)
         aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
-        self.aim = replace(aim, smoothed=smooth or aim.smoothed)
-        base = as_arrays(self.model.parameters if start is None else start)
-        if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
-            base = base._replace(truth=no_correction())
-        self.base = base if axes is None else with_axes(self.model, base, axes, free)
-        self.layout = layout(self.model, self.base, free, len(learnt))
-        self.groups = prepare_groups(
-            self.model, learnt, burn_in_s=burn_in_s, need_truth=self.aim.needs_truth
-        )
-        self.counts = descent.total_counts(self.groups, self.aim)
-        self.start = descent.on_host(self.layout.to_free(self.base))
-        rows = sum(int(visible_rows(data)) for data in self.groups)
-        self.prior_weight = self.aim.prior / max(rows, 1)
+        aim = replace(aim, smoothed=smooth or aim.smoothed)
+        base = starting(chosen, start, free, axes)
+        where = layout(chosen, base, free, len(learnt))
+        groups = prepare_groups(chosen, learnt, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
+        # It is never stepped: its value is what is searched.
+        search = Descent(chosen, aim, where, base, groups, None, iterations=0)
+        self.base, self.layout = base, where
+        self.start, self.value = search.start, search.value
 
     @property
     def relative(self) -> Flags:
@@ -255,13 +249,6 @@ class _Problem:
         """(n,) first steps; a leaf of calibration has its natural unit as the unit of its free numbers."""
         linear = [leaf.kind == "linear" for leaf in self.layout.leaves for _ in range(leaf.size)]
         return np.where(linear, 1.0, _FIRST_STEP)
-
-    def value(self, free: Floats) -> float:
-        """The objective, prior included; one filtering of all runs."""
-        given = self.model, self.aim, self.layout, free, self.base
-        value = sum(float(descent._value(*given, data, self.counts)) for data in self.groups)
-        off = (free - self.start) / self.layout.prior
-        return value + 0.5 * self.prior_weight * float(off @ off)
 
     def searched(self, found: Found) -> Searched:
         params = self.layout.from_free(jnp.asarray(found.best), self.base)

@@ -158,12 +158,22 @@ class Descent:
         ]
         self.evaluations += 1
         gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
-        off = (plain - self.start) / self.layout.prior
+        prior, slope = self._prior(plain)
+        gradient = np.where(self.fixed, 0.0, gradient + slope)
+        return sum(float(value) for value, _ in found) + prior, jnp.asarray(gradient)
+
+    def value(self, free: Any) -> float:
+        """The objective of the training runs, prior included: one filtering of all of them."""
+        plain = on_host(free)
+        given = self.model, self.objective, self.layout, plain, self.base
+        found = [float(_value(*given, data, self.training_counts)) for data in self.training]
+        return sum(found) + self._prior(plain)[0]
+
+    def _prior(self, free: Floats) -> tuple[float, Floats]:
+        """What the prior adds to the objective, and its gradient."""
         weight = self.objective.prior / self._rows
-        gradient = gradient + weight * off / self.layout.prior
-        gradient = np.where(self.fixed, 0.0, gradient)
-        value = sum(float(value) for value, _ in found)
-        return value + 0.5 * weight * float(off @ off), jnp.asarray(gradient)
+        off = (free - self.start) / self.layout.prior
+        return 0.5 * weight * float(off @ off), weight * off / self.layout.prior
 
     def validation_value(self, free: Any) -> float:
         """The objective of the validation runs; their own parameters come from their innovations."""
@@ -313,7 +323,7 @@ def own_step(
     """A step of Fisher scoring on what each run has of its own, by its innovations and the prior about
     `centre`; what is shared stays."""
     own = where.own_of_one_run
-    prior = np.concatenate([np.full(leaf.each, leaf.prior) for leaf in where.leaves])[own] ** -2.0
+    prior = where.of_one_run().prior[own] ** -2.0
     found = free.copy()
     for data in groups:
         index = where.index(np.asarray(data.place))

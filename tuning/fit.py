@@ -168,7 +168,7 @@ def tune(
     chosen = adapted(get_model(model), [*learnt, *judging])
     aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
     aim = replace(aim, smoothed=smooth or aim.smoothed)
-    base = _base(chosen, start, free, axes)
+    base = starting(chosen, start, free, axes)
     where = layout(chosen, base, free, len(learnt))
     if where.is_truth.any() and not aim.needs_truth:
         raise TuningError(
@@ -205,7 +205,7 @@ def tune(
     return tuned
 
 
-def _base(
+def starting(
     model: Model,
     start: Parameters | None,
     free: Sequence[str | Free] | None,

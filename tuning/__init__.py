@@ -16,6 +16,7 @@ from tuning.objectives import (
     rate_error,
 )
 from tuning.spec import read_free
+from tuning.starts import Outcome
 from tuning.validation import Comparison, Row, compare, mean_by_variant
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "Iteration",
     "Layout",
     "Objective",
+    "Outcome",
     "ParameterSpread",
     "Row",
     "Searched",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -49,7 +49,7 @@ class Best(NamedTuple):
     step: Iteration
 
 
-def _objective_value(
+def evaluate_at(
     model: Model,
     objective: Objective,
     where: Layout,
@@ -58,12 +58,22 @@ def _objective_value(
     data: Data,
     counts: dict[str, Array],
 ) -> Array:
+    """The objective of a group's runs at a free vector."""
     every = where.of_runs(where.from_free(free, base), data.setup, data.place)
     return evaluate_each(model, objective, every, data, counts)
 
 
-_value = jit(_objective_value, static_argnums=(0, 1, 2))
-_value_and_gradient = jit(jax.value_and_grad(_objective_value, 3), static_argnums=(0, 1, 2))
+_value = jit(evaluate_at, static_argnums=(0, 1, 2))
+_value_and_gradient = jit(jax.value_and_grad(evaluate_at, 3), static_argnums=(0, 1, 2))
+
+
+@partial(jit, static_argnums=(0, 1, 2))
+def _values_and_gradients(
+    model: Model, objective: Objective, where: Layout, free: Array, *given: Any
+) -> tuple[Array, Array]:
+    """The same at several points (points, n): all runs at all of them side by side."""
+    point = jax.value_and_grad(partial(evaluate_at, model, objective, where))
+    return jax.vmap(lambda each: point(each, *given))(free)
 
 
 def on_host(free: Any) -> Any:
@@ -95,6 +105,8 @@ class Descent:
     """Whether steps are those of Fisher scoring; for an objective of likelihood and prior."""
     keep: Callable[[dict[str, Any]], None] | None = None
     """Called after each step with all that the loop goes on from."""
+    width: int = 1
+    """Points that are evaluated side by side, so that one program serves for one and for many."""
     fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
     """(n,) numbers that stay at their start."""
     best: Best | None = None
@@ -102,6 +114,8 @@ class Descent:
     rounds: int = 0
     evaluations: int = 0
     """Of the objective with its gradient."""
+    stopped: str = ""
+    """Why it stopped; empty before it did."""
 
     def __post_init__(self) -> None:
         self.start = on_host(self.layout.to_free(self.base))
@@ -149,18 +163,30 @@ class Descent:
 
     def value_and_gradient(self, free: Any) -> tuple[float, Array]:
         """The objective of the training runs, prior included."""
-        counts, plain = self.training_counts, on_host(free)
-        found = [
-            _value_and_gradient(
-                self.model, self.objective, self.layout, plain, self.base, data, counts
-            )
-            for data in self.training
-        ]
-        self.evaluations += 1
+        plain = on_host(free)
+        if self.width > 1:
+            return self.completed(plain, *self.plain_values_and_gradients([plain])[0])
+        given = self.model, self.objective, self.layout, plain, self.base
+        found = [_value_and_gradient(*given, data, self.training_counts) for data in self.training]
         gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
-        prior, slope = self._prior(plain)
-        gradient = np.where(self.fixed, 0.0, gradient + slope)
-        return sum(float(value) for value, _ in found) + prior, jnp.asarray(gradient)
+        return self.completed(plain, sum(float(value) for value, _ in found), gradient)
+
+    def plain_values_and_gradients(self, points: Sequence[Floats]) -> list[tuple[float, Floats]]:
+        """Of up to `width` points at once, without the prior."""
+        filled = [*points, *[points[-1]] * (self.width - len(points))]
+        given = self.model, self.objective, self.layout, np.stack(filled), self.base
+        found = [
+            _values_and_gradients(*given, data, self.training_counts) for data in self.training
+        ]
+        values = sum((np.asarray(value) for value, _ in found), np.zeros(self.width))
+        gradients = sum((np.asarray(slope) for _, slope in found), np.zeros(given[3].shape))
+        return [(float(values[i]), gradients[i]) for i in range(len(points))]
+
+    def completed(self, free: Floats, value: float, gradient: Floats) -> tuple[float, Array]:
+        """Value and gradient of the runs with those of the prior, and none along what is fixed."""
+        self.evaluations += 1
+        prior, slope = self._prior(free)
+        return value + prior, jnp.asarray(np.where(self.fixed, 0.0, gradient + slope))
 
     def value(self, free: Any) -> float:
         """The objective of the training runs, prior included: one filtering of all of them."""
@@ -209,12 +235,17 @@ class Descent:
     def run(self, patience: int, progress: Progress | None) -> str:
         """Step until done; why it stopped."""
         try:
-            return self._step(patience, progress)
+            self.stopped = self.stopped or self._step(patience, progress)
         except KeyboardInterrupt:
-            self.best = self.best or self.fallback
-            if self.best is None:
-                raise
-            return "interrupted; the best so far is kept"
+            self.interrupt()
+        return self.stopped
+
+    def interrupt(self) -> None:
+        """Stop with the best so far; raises `KeyboardInterrupt` where there is none."""
+        self.best = self.best or self.fallback
+        if self.best is None:
+            raise KeyboardInterrupt
+        self.stopped = "interrupted; the best so far is kept"
 
     def warm(self, steps: int) -> None:
         """Begin not at the start but where some steps of Fisher scoring on the likelihood lead from there.
@@ -223,11 +254,16 @@ class Descent:
         """
         aim = Objective(likelihood=1.0, prior=1.0)
         given = (self.model, aim, self.layout, self.base, self.training, None, steps)
-        other = Descent(*given, fisher=True)
+        other = Descent(*given, fisher=True, width=self.width)
+        other.begin_at(self.walk.candidate)
         other.run(steps, None)
         assert other.best is not None
-        self.walk = self._walk(other.best.free)
+        self.begin_at(other.best.free)
         self.evaluations += other.evaluations
+
+    def begin_at(self, free: Any) -> None:
+        """Begin elsewhere than at the start, about which the prior stays."""
+        self.walk = self._walk(free)
 
     def again(self, fixed: Flags) -> None:
         """Go on from the best with more numbers held at their start, judged anew."""
@@ -237,23 +273,14 @@ class Descent:
         self.walk = self._walk(free)
         self.fallback = self.best._replace(free=free)
         self.best, self.rounds, self.since = None, self.rounds + 1, len(self.history)
+        self.stopped = ""
         # Enough to come back from the start of a few numbers.
         self.iterations = max(self.iterations, len(self.history) + 10)
 
     def _step(self, patience: int, progress: Progress | None) -> str:
         while len(self.history) < self.iterations:
-            number = len(self.history)
             value, gradient = self.value_and_gradient(self.walk.candidate)
-            finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
-            held = self.validation_value(self.walk.candidate) if finite else float("nan")
-            step = Iteration(number, value, held, not finite)
-            self.history.append(step)
-            if progress is not None:
-                progress(step, self.iterations)
-            self._judge(step, finite)
-            if number - self.since >= patience:
-                return f"no improvement in {patience} iterations"
-            if reason := self.walk.move(value, gradient, bool(finite)):
+            if reason := self.advance(value, gradient, patience, progress):
                 return reason
             if self.keep is not None:
                 self.keep(self.state_dict())
@@ -261,24 +288,50 @@ class Descent:
             raise TuningError(
                 f"got {self.iterations} iterations, expected at least one; ask for more"
             )
+        return self.all_done
+
+    @property
+    def all_done(self) -> str:
+        """The reason to stop after the last iteration."""
         return f"the {self.iterations} iterations asked for are done"
 
-    def _judge(self, step: Iteration, finite: bool) -> None:
+    def advance(
+        self, value: float, gradient: Array, patience: int, progress: Progress | None
+    ) -> str:
+        """Judge the candidate, which has this value and gradient, and choose the next; a reason to stop, or
+        nothing."""
+        finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
+        held = self.validation_value(self.walk.candidate) if finite else float("nan")
+        step = Iteration(len(self.history), value, held, not finite)
+        self.record(step, self.walk.candidate, progress)
+        if step.number - self.since >= patience:
+            return f"no improvement in {patience} iterations"
+        return self.walk.move(value, gradient, bool(finite))
+
+    def record(self, step: Iteration, free: Any, progress: Progress | None) -> None:
+        """Put a step down, and keep where it was if it is the best."""
+        self.history.append(step)
+        if progress is not None:
+            progress(step, self.iterations)
+        self._judge(step, free)
+
+    def _judge(self, step: Iteration, free: Any) -> None:
         """Keep the step if it is the best."""
-        judged = self._judged(step)
-        before = float("inf") if self.best is None else self._judged(self.best.step)
-        if finite and judged < before:
+        judged = self.judged(step)
+        before = float("inf") if self.best is None else self.judged(self.best.step)
+        if not step.rejected and judged < before:
             least = self.walk.least
             if judged < before - (_IMPROVEMENT * abs(judged) if least is None else least):
                 self.since = step.number
-            self.best = Best(on_host(self.walk.candidate), step)
+            self.best = Best(on_host(free), step)
         if self.best is None:
             raise TuningError(
                 f"got an objective of {judged} or a gradient that is not finite at the start,"
                 " expected finite ones; start from other noise or check the data"
             )
 
-    def _judged(self, step: Iteration) -> float:
+    def judged(self, step: Iteration) -> float:
+        """By what a step is the best: validation where there is any."""
         return step.training if self.validation is None else step.validation
 
     def state_dict(self) -> dict[str, Any]:
@@ -294,6 +347,7 @@ class Descent:
             "iterations": np.array(self.iterations),
             "evaluations": np.array(self.evaluations),
             "fixed": self.fixed,
+            "stopped": np.array(self.stopped),
         }
         if self.own_free is not None:
             found["own_free"] = np.asarray(self.own_free)
@@ -310,6 +364,7 @@ class Descent:
         self.since, self.rounds = int(kept["since"]), int(kept["rounds"])
         self.evaluations, self.iterations = int(kept["evaluations"]), int(kept["iterations"])
         self.own_free = kept.get("own_free")
+        self.stopped = str(kept["stopped"])
 
 
 def own_step(

@@ -1,9 +1,9 @@
 """The tuner: gradient steps over all training runs at once, judged on runs it does not learn from."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,16 +19,18 @@ from jaxekf.models import adapted, get_model
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import Flags, Floats, Recording
 from tuning import consistency, resume
+from tuning.batches import Batches
 from tuning.data import Data, prepare_groups
 from tuning.descent import Descent, Iteration, Progress, own_step
 from tuning.frame import TruthFrame, no_correction
 from tuning.information import Information, information, interval, what_would_tell
 from tuning.noise import Free, Layout, layout, scaled, with_axes
 from tuning.objectives import Objective, attitude_error, parse
+from tuning.starts import Outcome, Race, draw, points_at_once
 
 _ROUNDS = 2
 """Times that the search goes on after something was found to be open and was fixed at its start."""
-OPTIMISERS = ("lbfgs", "fisher")
+OPTIMISERS = ("lbfgs", "fisher", "adam")
 _OWN_FIT = 8
 _WARM_STEPS = 12
 
@@ -61,7 +63,9 @@ class Tuned:
     fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
     """(n,) numbers that the data leave open and that stayed at their start."""
     evaluations: int = 0
-    """Of the objective with its gradient."""
+    """Of the objective with its gradient, from all starts; with batches passes over all runs."""
+    starts: tuple[Outcome, ...] = ()
+    """What became of each start, the given one first, where there were several."""
 
     @property
     def rejections(self) -> int:
@@ -130,7 +134,10 @@ def tune(
     smooth: bool = False,
     judge: bool = False,
     warm: bool = False,
-    optimiser: optax.GradientTransformation | Literal["lbfgs", "fisher"] = "lbfgs",
+    optimiser: optax.GradientTransformation | Literal["lbfgs", "fisher", "adam"] = "lbfgs",
+    starts: int = 1,
+    batch: int | None = None,
+    seed: int = 0,
     checkpoint: Path | str | None = None,
     progress: Progress | None = None,
 ) -> Tuned:
@@ -141,7 +148,14 @@ def tune(
     clock and frames (`TruthFrame`). `axes` gives what is free one deviation for all axes (`tied`), one for
     `each`, or a `full` matrix; None leaves it as the start has it. With `smooth` errors are those of the
     smoothed estimate. The optimiser is L-BFGS; ``fisher`` scoring for likelihood and `map`, which needs few
-    steps of two runs of the filter for each number: for up to some thirty; or any of optax.
+    steps of two runs of the filter for each number: for up to some thirty; ``adam`` steps on `batch` runs
+    at a time (16 unless given), an iteration being a pass over all of them, for very many runs; or any of
+    optax.
+
+    With several `starts` the search begins at the given one and at others drawn about it by the `seed`:
+    deviations off by up to one and a half decades or their priors, calibration by half its prior's
+    deviation. They go side by side in one program; after 8, 16 and 32 iterations the worse half is
+    dropped, so that eight cost far less than eight times as much as one. The best is gone on with.
 
     The best parameters so far are kept, by the validation runs where there are any; what these have of
     their own is found from their innovations, never from their truth. The tuner stops when they have not
@@ -179,29 +193,34 @@ def tune(
     options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
     training = prepare_groups(chosen, learnt, **options)
     held_out = prepare_groups(chosen, judging, **options) if validate else None
-    fisher = _is_fisher(optimiser, aim)
-    own = None if isinstance(optimiser, str) else optimiser
-    search = Descent(chosen, aim, where, base, training, held_out, iterations, own, fisher=fisher)
+    make = _searcher(optimiser, aim, starts, batch, seed)
+    width = points_at_once(training, starts)
+    race = Race(
+        [
+            make(chosen, aim, where, base, training, held_out, iterations, width=width)
+            for _ in range(starts)
+        ]
+    )
+    for one, point in zip(
+        race.searches[1:], draw(where, race.searches[0].start, starts, seed)[1:], strict=True
+    ):
+        one.begin_at(point)
     if checkpoint is not None:
-        asked = (
-            _names(runs),
-            _names(validate),
-            iterations,
-            patience,
-            burn_in_s,
-            judge,
-            warm,
-            fisher,
-        )
-        resume.attach(search, Path(checkpoint), repr(asked))
-    if warm and not search.history:
-        search.warm(_WARM_STEPS)
+        asked = (_names(runs), _names(validate), iterations, patience, burn_in_s, judge, warm)
+        how = (optimiser if isinstance(optimiser, str) else "own", starts, batch, seed)
+        resume.attach(race, Path(checkpoint), repr((*asked, *how)))
+    for one in race.searches if warm else ():
+        if not one.history:
+            one.warm(_WARM_STEPS)
+    search = race.run(patience, progress)
     known, stopped = _search(search, patience, judge, progress)
     if rescale is None:
         rescale = not aim.likelihood and not aim.truth and "attitude" in training[0].truth
     tuned = _told(search, known, stopped, _names(runs), _names(validate), rescale=rescale)
     if checkpoint is not None:
         Path(checkpoint).unlink(missing_ok=True)
+    if starts > 1:
+        tuned = replace(tuned, starts=race.outcomes, evaluations=race.evaluations)
     return tuned
 
 
@@ -218,19 +237,38 @@ def starting(
     return base if axes is None else with_axes(model, base, axes, free)
 
 
-def _is_fisher(optimiser: Any, aim: Objective) -> bool:
-    if not isinstance(optimiser, str):
-        return False
-    if optimiser not in OPTIMISERS:
+def _searcher(
+    optimiser: Any, aim: Objective, starts: int, batch: int | None, seed: int
+) -> Callable[..., Descent]:
+    """What makes a search of the kind asked for."""
+    if isinstance(optimiser, str) and optimiser not in OPTIMISERS:
         raise TuningError(
             f"got the optimiser '{optimiser}', expected one of {OPTIMISERS} or one of optax; choose one"
+        )
+    if starts < 1 or (batch is not None and batch < 1):
+        raise TuningError(
+            f"got {starts} starts and batches of {batch} runs, expected at least one; ask for more"
         )
     if optimiser == "fisher" and (aim.errors or aim.truth):
         raise TuningError(
             f"got Fisher scoring for '{aim.describe()}', expected likelihood or map, whose curvature it"
             " knows; take lbfgs"
         )
-    return optimiser == "fisher"
+    if isinstance(optimiser, str) and optimiser == "adam":
+        if starts > 1:
+            raise TuningError(
+                f"got {starts} starts with adam, expected one, for its batches differ from step to step;"
+                " take lbfgs or fisher"
+            )
+        return partial(Batches, size=batch or Batches.size, seed=seed)
+    if batch is not None:
+        raise TuningError(
+            f"got batches of {batch} runs for another optimiser than adam, expected none; take adam, or"
+            " leave the batches out"
+        )
+    if isinstance(optimiser, str):
+        return partial(Descent, fisher=optimiser == "fisher")
+    return partial(Descent, optimiser=optimiser)
 
 
 def _told(

@@ -12,18 +12,19 @@ import numpy as np
 from jaxekf.errors import TuningError
 from jaxekf.files import whole_file
 from tuning.descent import Descent
+from tuning.starts import Race
 
-_KIND = "jaxekf tuning, version 1"
+_KIND = "jaxekf tuning, version 2"
 
 
-def attach(search: Descent, path: Path, asked: str) -> None:
-    """Keep the state of a search in a file, and go on from there if it is the same search's.
+def attach(race: Race, path: Path, asked: str) -> None:
+    """Keep the state of searches in a file, and go on from there if it is the same searches'.
 
     `asked` is what else makes it the same. Raises `TuningError` for a file that is not, or no such file.
     """
-    mark = _mark(search, asked)
+    mark = _mark(race.searches[0], asked)
     if path.exists():
-        search.restore(_read(path, mark))
+        race.restore(_read(path, mark))
 
     def keep(state: dict[str, Any]) -> None:
         with whole_file(path, overwrite=True) as file:
@@ -31,7 +32,7 @@ def attach(search: Descent, path: Path, asked: str) -> None:
             np.savez(buffer, allow_pickle=False, kind=_KIND, mark=mark, **state)
             file.write_bytes(buffer.getvalue())
 
-    search.keep = keep
+    race.keep = keep
 
 
 def _mark(search: Descent, asked: str) -> str:

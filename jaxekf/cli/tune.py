@@ -26,6 +26,7 @@ from jaxekf.files import check_output
 from jaxekf.model import Parameters
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
+from tuning.fit import OPTIMISERS
 from tuning.noise import AXES
 from tuning.objectives import parse
 from tuning.spec import read_free
@@ -73,10 +74,31 @@ from tuning.validation import as_dicts
 )
 @click.option(
     "--optimiser",
-    type=click.Choice(("lbfgs", "fisher")),
+    type=click.Choice(OPTIMISERS),
     default="lbfgs",
     show_default=True,
-    help="fisher scoring takes few steps to the end; for likelihood or map, and up to some thirty numbers.",
+    help="fisher scoring takes few steps to the end; for likelihood or map, and up to some thirty numbers."
+    " adam takes some runs at a time, for very many.",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Search from so many starts side by side, the given one and others drawn about it; the worse half"
+    " is dropped after 8, 16 and 32 iterations.",
+)
+@click.option(
+    "--batch",
+    type=click.IntRange(1),
+    help="Runs of a step of adam; an iteration is a pass over all of them.  [default: 16]",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of the starts that are drawn, and of the order of adam's batches.",
 )
 @click.option("--iterations", type=click.IntRange(1), default=60, show_default=True)
 @click.option(
@@ -131,7 +153,10 @@ def tune(
     own: tuple[str, ...],
     spec: Path | None,
     axes: str | None,
-    optimiser: Literal["lbfgs", "fisher"],
+    optimiser: Literal["lbfgs", "fisher", "adam"],
+    starts: int,
+    batch: int | None,
+    seed: int,
     iterations: int,
     patience: int,
     burn_in: float,
@@ -169,6 +194,9 @@ def tune(
         "start": start,
         "axes": axes,
         "optimiser": optimiser,
+        "starts": starts,
+        "batch": batch,
+        "seed": seed,
         "iterations": iterations,
         "patience": patience,
         "burn_in_s": burn_in,
@@ -196,10 +224,12 @@ def tune(
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
+        document["starts"] = [one._asdict() for one in tuned.starts]
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
     _print_noise(tuned)
+    _print_starts(tuned)
     _print_known(tuned)
     if rows:
         on = "validation runs" if held_out else "the training runs themselves"
@@ -234,6 +264,17 @@ def _known(tuned: tuning.Tuned) -> dict[str, Any]:
             name: {k: told[k] for k in ("noise", "calibration")} for name, told in each.items()
         },
     }
+
+
+def _print_starts(tuned: tuning.Tuned) -> None:
+    """What became of each start, where there were several."""
+    if not tuned.starts:
+        return
+    rows = [
+        [str(i), f"{one.value:.6g}", str(one.iterations), one.ending]
+        for i, one in enumerate(tuned.starts)
+    ]
+    print_table("Starts (0 is the given one)", ["start", "reached", "iterations", "ending"], rows)
 
 
 def _print_known(tuned: tuning.Tuned) -> None:

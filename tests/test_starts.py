@@ -1,0 +1,210 @@
+"""Several starts side by side, and Adam on some runs at a time: the same problem, other ways down."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import jaxekf
+import tuning
+from jaxekf import simulate
+from jaxekf.errors import TuningError
+from jaxekf.parameters import as_arrays
+from tuning import starts as starting
+from tuning.batches import Batches, cut
+from tuning.data import prepare_groups
+from tuning.descent import Best, Descent, Iteration
+from tuning.frame import no_correction
+from tuning.noise import layout
+
+OPTIONS: dict[str, Any] = {"objective": "likelihood", "free": ["noise"], "iterations": 40}
+MODEL = jaxekf.get_model("loose")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Three short runs; the start that all tests have is far off."""
+    return [
+        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=6.0)
+        for i in range(3)
+    ]
+
+
+@pytest.fixture(scope="module")
+def start():
+    noise = MODEL.parameters.noise
+    return as_arrays(
+        MODEL.parameters._replace(
+            noise=noise._replace(gyroscope=8.0 * noise.gyroscope, optical=0.2 * noise.optical)
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def alone(runs, start):
+    return tuning.tune(runs, start=start, **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def race(runs, start):
+    return tuning.tune(runs, start=start, starts=4, **OPTIONS)
+
+
+def test_each_start_goes_its_own_way(alone, race):
+    """Would catch runs of one start that come into the objective of another, and a search that depends on
+    what runs beside it."""
+    assert len(race.starts) == 4
+    assert race.best.training <= min(one.value for one in race.starts)
+    assert race.best.training == min(one.value for one in race.starts)
+    # The given start goes down just as it does alone, until it is dropped or has ended.
+    first = race.starts[0]
+    best = min(step.training for step in alone.history[: first.iterations])
+    assert first.value == pytest.approx(best, abs=1e-6)
+    assert race.best.training <= alone.best.training + 1e-4
+
+
+def test_bad_starts_are_dropped(race):
+    """Would catch starts that all run to the end, so that eight cost eight times as much as one."""
+    dropped = [one for one in race.starts if one.ending.startswith("dropped after 8")]
+    assert dropped
+    assert all(one.iterations == 8 for one in dropped)
+    assert race.evaluations == sum(one.iterations for one in race.starts)
+
+
+def test_the_worse_half_is_dropped():
+    """Would catch the better half being dropped, and one that stopped at a bad place driving out others."""
+
+    def search(value, stopped=""):
+        step = Iteration(7, value, float("nan"), False)
+        return SimpleNamespace(best=Best(None, step), judged=lambda s: s.training, stopped=stopped)
+
+    values = [3.0, 1.0, 2.0, 5.0, 4.0, 6.0]
+    one: Any = [search(value, "converged" if value in (1.0, 6.0) else "") for value in values]
+    found = starting.Race(one, round=8)
+    found._drop_half()
+    assert set(found.dropped) == {3, 4}
+    assert found.running == [0, 2]
+    assert found.winner is one[1]
+
+
+def test_starts_are_drawn_within_their_reach(runs):
+    """Would catch starts so far off that none of them helps, or all at one place."""
+    free = [
+        "noise",
+        tuning.Free("initial.bias", prior=0.1),
+        "calibration.clock_offset",
+        "truth.origin",
+    ]
+    base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
+    where = layout(MODEL, base, free)
+    middle = np.asarray(where.to_free(base))
+    drawn = np.array(starting.draw(where, middle, 200, seed=3)) - middle
+    np.testing.assert_array_equal(drawn[0], 0.0)
+    reach = np.abs(drawn).max(axis=0)
+    labels = where.labels()
+    for i, label in enumerate(labels):
+        most = {"noise": 1.5 * np.log(10.0), "initial": 0.15, "calibration": 5.0, "truth": 0.0}
+        limit = most[label.split(".")[0]]
+        assert 0.9 * limit <= reach[i] <= limit, label
+    again = np.array(starting.draw(where, middle, 200, seed=3)) - middle
+    np.testing.assert_array_equal(drawn, again)
+
+
+def test_a_start_without_a_finite_objective_begins_nearer(runs, start):
+    """Would catch one impossible start that ends the tuning of all, or is passed over."""
+    where = layout(MODEL, start, OPTIONS["free"])
+    groups = prepare_groups(MODEL, runs, need_truth=False)
+    aim = tuning.innovation_likelihood()
+    made = [Descent(MODEL, aim, where, start, groups, None, 40, width=4) for _ in range(4)]
+    middle = made[0].start
+    made[1].begin_at(middle + 1500.0)
+    made[2].begin_at(np.full_like(middle, np.nan))
+    made[3].begin_at(middle + 1.0)
+    found = starting.Race(made)
+    for _ in range(6):
+        found._round(patience=15)
+    assert found.outcomes[1].value < np.inf
+    assert "not finite" in found.outcomes[2].ending
+    assert found.outcomes[2].value == np.inf
+    assert found.outcomes[0].iterations == 6
+
+
+class Stop(Exception):
+    """Stands for a process that ends."""
+
+
+def stop_at(number):
+    def progress(step, total):
+        if step.number == number:
+            raise Stop
+
+    return progress
+
+
+@pytest.mark.parametrize("how", ["starts", "adam"])
+def test_goes_on_after_a_stop(how, runs, start, race, tmp_path):
+    """Would catch a part of the state that is not kept: who is dropped, Adam's moments, the rate."""
+    options: dict[str, Any] = {**OPTIONS, "start": start}
+    options |= {"starts": 4} if how == "starts" else {"optimiser": "adam", "batch": 2}
+    whole = race if how == "starts" else tuning.tune(runs, **options)
+    state = tmp_path / "state.npz"
+    for number in (5, 11):
+        with pytest.raises(Stop):
+            tuning.tune(runs, checkpoint=state, progress=stop_at(number), **options)
+    again = tuning.tune(runs, checkpoint=state, **options)
+    assert not state.exists()
+    np.testing.assert_allclose(again.free, whole.free, rtol=0.0, atol=1e-12)
+    assert str(again.history) == str(whole.history)
+    assert again.starts == whole.starts
+
+
+def test_batches_come_to_the_same_place(runs, start, alone):
+    """Would catch a gradient of some runs that is not that of the whole on average, a rate that never
+    falls, and a best that was not judged on all runs."""
+    longer = OPTIONS | {"iterations": 80}
+    tuned = tuning.tune(runs, start=start, optimiser="adam", batch=2, **longer)
+    assert tuned.best.training <= alone.best.training + 5e-3
+    assert tuned.best.training == min(step.training for step in tuned.history)
+    assert tuned.best.training < tuned.history[0].training - 0.1
+
+
+def test_each_pass_takes_every_run(runs):
+    """Would catch runs that are left out of a pass, and an order that is always the same."""
+    data = prepare_groups(MODEL, runs, need_truth=False)[0]
+    rng = np.random.default_rng(0)
+    orders = [cut(data, 2, rng) for _ in range(5)]
+    for order in orders:
+        assert [len(batch) for batch in order] == [2, 2]
+        assert set(np.concatenate(order)) == {0, 1, 2}
+    assert len({tuple(np.concatenate(order)) for order in orders}) > 1
+    assert [len(batch) for batch in cut(data, 16, rng)] == [3]
+
+
+def test_a_pass_that_fails_is_repeated_from_the_best(runs, start):
+    """Would catch Adam walking on from where nothing is finite."""
+    where = layout(MODEL, start, OPTIONS["free"])
+    groups = prepare_groups(MODEL, runs, need_truth=False)
+    aim = tuning.innovation_likelihood()
+    search = Batches(MODEL, aim, where, start, groups, None, 3, size=2)
+    search.rate = 2000.0
+    search.run(15, None)
+    assert [step.rejected for step in search.history] == [False, True, True]
+    assert search.best is not None
+    np.testing.assert_array_equal(search.best.free, search.start)
+    assert search.rate == pytest.approx(2000.0 / 16.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"starts": 0}, "0 starts"),
+        ({"optimiser": "adam", "starts": 2}, "2 starts with adam"),
+        ({"batch": 4}, "another optimiser than adam"),
+        ({"optimiser": "adam", "batch": 0}, "batches of 0"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options, words, runs):
+    """Would catch an option that is passed over in silence."""
+    with pytest.raises(TuningError, match=words):
+        tuning.tune(runs, **options)

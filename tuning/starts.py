@@ -1,0 +1,189 @@
+"""Several searches from different starts, side by side in one program; the worse half is dropped early."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxekf.blocks import LANES
+from jaxekf.recording import Floats
+from tuning.data import Data
+from tuning.descent import Descent, Progress
+from tuning.noise import Layout
+
+_SPREAD = 1.5
+"""Prior deviations that a start may lie off: of a logarithm with a weak prior one and a half decades."""
+_NEAR = 0.5
+"""The same of calibration, of which one knows more."""
+_DECADES = 1.5 * float(np.log(10.0))
+RUNGS = (8, 16, 32)
+"""Iterations after which the worse half of the searches is dropped."""
+_TRIES = 5
+
+
+class Outcome(NamedTuple):
+    """What became of one start."""
+
+    value: float
+    """The best it came to, by validation where there is any; infinite where it could not begin."""
+    iterations: int
+    ending: str
+    """Why it ended, in words."""
+
+
+def draw(where: Layout, start: Floats, count: int, seed: int) -> list[Floats]:
+    """Free vectors to start from: the given one, and others about it, uniform within 1.5 deviations of the
+    prior for logarithms (at most 1.5 decades), half a deviation for calibration; the truth's stay."""
+    is_logarithm = [leaf.is_logarithm(i) for leaf in where.leaves for i in range(leaf.size)]
+    wide = np.minimum(_SPREAD * where.prior, _DECADES)
+    reach = np.where(is_logarithm, wide, _NEAR * where.prior)
+    reach = np.where(where.is_truth, 0.0, reach)
+    rng = np.random.default_rng(seed)
+    others = start + reach * rng.uniform(-1.0, 1.0, (count - 1, len(start)))
+    return [start, *others]
+
+
+def points_at_once(groups: Sequence[Data], starts: int, devices: int | None = None) -> int:
+    """Points that fill the lanes of all processors with the runs of the largest group."""
+    runs = max(len(data.place) for data in groups)
+    lanes = LANES * ((os.cpu_count() or 1) if devices is None else devices)
+    return min(starts, max(1, lanes // runs))
+
+
+@dataclass
+class Race:
+    """Searches that step together. Each is a `Descent` of the same problem, with the same `width`."""
+
+    searches: list[Descent]
+    keep: Callable[[dict[str, Any]], None] | None = None
+    """As `Descent.keep`, for all of them together."""
+    dropped: dict[int, str] = field(default_factory=dict)
+    """Searches that are out, and why."""
+    round: int = 0
+
+    def __post_init__(self) -> None:
+        self.tries = [0] * len(self.searches)
+        for search in self.searches:
+            search.keep = self._keep_all
+
+    @property
+    def running(self) -> list[int]:
+        """Searches that go on."""
+        return [
+            i for i, one in enumerate(self.searches) if i not in self.dropped and not one.stopped
+        ]
+
+    @property
+    def _leader(self) -> int:
+        return min(range(len(self.searches)), key=self._reached)
+
+    @property
+    def winner(self) -> Descent:
+        """The search with the best step so far."""
+        return self.searches[self._leader]
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """What became of each start."""
+        found = []
+        for i, one in enumerate(self.searches):
+            ending = self.dropped.get(i, one.stopped)
+            found.append(Outcome(self._reached(i), len(one.history), ending))
+        return tuple(found)
+
+    @property
+    def evaluations(self) -> int:
+        """Of the objective with its gradient, all searches together."""
+        return sum(one.evaluations for one in self.searches)
+
+    def run(self, patience: int, progress: Progress | None) -> Descent:
+        """Step all until one is left or all have stopped; the one with the best step."""
+        try:
+            while self.running and self.running != [self._leader]:
+                self._round(patience)
+                if progress is not None:
+                    best = self.winner.best
+                    assert best is not None
+                    progress(best.step._replace(number=self.round - 1), self.searches[0].iterations)
+                if self.round in RUNGS:
+                    self._drop_half()
+                self._keep_all({})
+        except KeyboardInterrupt:
+            self.winner.interrupt()
+            for i in self.running:
+                self.dropped[i] = self.winner.stopped
+        return self.winner
+
+    def _round(self, patience: int) -> None:
+        """One step of each."""
+        running = self.running
+        width = self.searches[0].width
+        for first in range(0, len(running), width):
+            chosen = running[first : first + width]
+            points = [np.asarray(self.searches[i].walk.candidate) for i in chosen]
+            if width > 1:
+                plain = self.searches[0].plain_values_and_gradients(points)
+                told = [
+                    self.searches[i].completed(point, *each)
+                    for i, point, each in zip(chosen, points, plain, strict=True)
+                ]
+            else:
+                told = [self.searches[chosen[0]].value_and_gradient(points[0])]
+            for i, (value, gradient) in zip(chosen, told, strict=True):
+                self._advance(i, value, gradient, patience)
+        self.round += 1
+
+    def _advance(self, i: int, value: float, gradient: Any, patience: int) -> None:
+        search = self.searches[i]
+        finite = np.isfinite(value) and bool(np.all(np.isfinite(gradient)))
+        if i and search.best is None and not finite:
+            # Where it should begin nothing is finite: begin half as far from the given start.
+            self.tries[i] += 1
+            if self.tries[i] >= _TRIES:
+                self.dropped[i] = "dropped: the objective is not finite where it should begin"
+            else:
+                search.begin_at(0.5 * (search.start + np.asarray(search.walk.candidate)))
+            return
+        search.stopped = search.advance(value, gradient, patience, None)
+        if not search.stopped and len(search.history) >= search.iterations:
+            search.stopped = search.all_done
+
+    def _drop_half(self) -> None:
+        """The worse half ends; one that has stopped stays in the comparison."""
+        running = set(self.running)
+        left = [i for i in range(len(self.searches)) if i not in self.dropped]
+        order = sorted(left, key=self._reached)
+        for i in running.intersection(order[(len(order) + 1) // 2 :]):
+            self.dropped[i] = f"dropped after {self.round} iterations: others had come further"
+
+    def _reached(self, i: int) -> float:
+        search = self.searches[i]
+        return float("inf") if search.best is None else search.judged(search.best.step)
+
+    def _keep_all(self, _: dict[str, Any]) -> None:
+        if self.keep is not None:
+            self.keep(self.state_dict())
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the race, and the search that goes on after it, go on from."""
+        found: dict[str, Any] = {"round": np.array(self.round), "tries": np.array(self.tries)}
+        found["out"] = np.array(list(self.dropped), int)
+        found["why_out"] = np.array(list(self.dropped.values()), str)
+        for i, search in enumerate(self.searches):
+            if search.best is not None:
+                found |= {f"start{i}_{name}": v for name, v in search.state_dict().items()}
+        return found
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """Go on from where `state_dict` was taken."""
+        self.round, self.tries = int(kept["round"]), [int(n) for n in kept["tries"]]
+        self.dropped = {
+            int(i): str(why) for i, why in zip(kept["out"], kept["why_out"], strict=True)
+        }
+        for i, search in enumerate(self.searches):
+            mine = f"start{i}_"
+            own = {k.removeprefix(mine): v for k, v in kept.items() if k.startswith(mine)}
+            if own:
+                search.restore(own)

@@ -162,7 +162,7 @@ def test_goes_on_after_a_stop(how, runs, start, race, tmp_path):
 def test_batches_come_to_the_same_place(runs, start, alone):
     """Would catch a gradient of some runs that is not that of the whole on average, a rate that never
     falls, and a best that was not judged on all runs."""
-    longer = OPTIONS | {"iterations": 80}
+    longer: dict[str, Any] = OPTIONS | {"iterations": 80}
     tuned = tuning.tune(runs, start=start, optimiser="adam", batch=2, **longer)
     assert tuned.best.training <= alone.best.training + 5e-3
     assert tuned.best.training == min(step.training for step in tuned.history)

@@ -28,9 +28,9 @@ def allan_only(
 ) -> AllanOnly:
     """The start with the noise that the static heads of runs tell, each weighted by how long it rests.
 
-    A bias walk is that of the run that rests longest. What a static log tells is taken from there, and the
-    rest from the runs. A full matrix of the start becomes a diagonal one where its noise is told. Raises
-    `TuningError` where nothing rests.
+    Of bias walks the run that rests longest alone decides, or a static log where there is one, for a short
+    rest makes them up. What else a log tells is taken from there, and the rest from the runs. A full matrix
+    of the start becomes a diagonal one where its noise is told. Raises `TuningError` where nothing rests.
     """
     own = replace(model, parameters=start)
     heads = [noise for noise in map(_head, runs) if noise is not None]
@@ -40,7 +40,10 @@ def allan_only(
             " take noise by Allan deviation from; add runs that begin with some seconds of rest, give a"
             " static log, or leave out allan"
         )
-    found = _pooled(own, heads) | ({} if log is None else _pooled(own, [static_noise(log)]))
+    found = _pooled(own, heads)
+    if log is not None:
+        found = {name: value for name, value in found.items() if "walk" not in name}
+        found |= _pooled(own, [static_noise(log)])
     noise = as_arrays(start).noise
     changes = {name: _like(value, getattr(noise, name)) for name, value in found.items()}
     return AllanOnly(
@@ -63,11 +66,10 @@ def _pooled(model: Model, rests: Sequence[StaticNoise]) -> dict[str, Floats]:
     )
     found: dict[str, Floats] = {}
     for name in dict.fromkeys(name for _, start in told for name in start.taken):
-        having = [(s, start) for s, start in told if name in start.taken]
-        values = np.array([getattr(start.params.noise, name) for _, start in having])
-        if "walk" in name:
-            found[name] = values[0]
-        else:
+        able = told[:1] if "walk" in name else told
+        having = [(s, start) for s, start in able if name in start.taken]
+        if having:
+            values = np.array([getattr(start.params.noise, name) for _, start in having])
             square = np.average(values**2, axis=0, weights=[s for s, _ in having])
             found[name] = np.sqrt(square)
     return found

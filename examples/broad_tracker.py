@@ -92,11 +92,11 @@ def hold_out(
     print(
         "held out in turn, mean ± deviation of a trial (worst); a filtering is one of all training trials"
     )
-    print(f"{'':>12}{'attitude RMSE, deg':>26}{'NEES':>24}{'filterings':>12}")
+    print(f"{'':>12}{'attitude RMSE, deg':>28}{'NEES':>30}{'filterings':>12}")
     for variant, told in errors.items():
         texts = [f"{a.mean:.3f} ± {a.deviation:.3f} ({a.worst:.3f})" for a in (told, nees[variant])]
         work = found.forward.get(variant, float("nan"))
-        print(f"{variant:>12}{texts[0]:>26}{texts[1]:>24}{work:>12.0f}")
+        print(f"{variant:>12}{texts[0]:>28}{texts[1]:>30}{work:>12.0f}")
     return found.as_dict()
 
 

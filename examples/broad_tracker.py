@@ -56,6 +56,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument("--beside", nargs="*", choices=tuning.BESIDE, help="hold out, with these")
+    parser.add_argument("--warm", action="store_true", help="begin with steps on the likelihood")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
     which.add_argument(
@@ -72,6 +73,7 @@ def say_progress(step: tuning.Iteration, total: int) -> None:
 def asked(arguments: argparse.Namespace) -> dict[str, Any]:
     """What is tuned, and by what."""
     found: dict[str, Any] = {"free": ["noise", *CALIBRATION], "iterations": arguments.iterations}
+    found["warm"] = arguments.warm
     if arguments.noise_only:
         found["free"] = ["noise"]
     if arguments.calibrate:

@@ -8,6 +8,8 @@ are tuned by gradient on the training trials together with the gyroscope's clock
 (`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed. With
 `--calibrate` the objective is the likelihood of what was measured, with priors, and each trial has a
 matrix of its own, that of a test trial found from its innovations alone: its truth is for the score only.
+With `--beside` each training trial is first held out in turn, and noise by Allan deviation alone and
+searches without gradients are set beside the tuning, with the work that each takes.
 
 The last line printed is JSON with the attitude RMSE in degrees of each test trial.
 """
@@ -53,6 +55,8 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--test", nargs="+", required=True, metavar="TRIAL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, default=20)
+    parser.add_argument("--beside", nargs="*", choices=tuning.BESIDE, help="hold out, with these")
+    parser.add_argument("--warm", action="store_true", help="begin with steps on the likelihood")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
     which.add_argument(
@@ -69,6 +73,7 @@ def say_progress(step: tuning.Iteration, total: int) -> None:
 def asked(arguments: argparse.Namespace) -> dict[str, Any]:
     """What is tuned, and by what."""
     found: dict[str, Any] = {"free": ["noise", *CALIBRATION], "iterations": arguments.iterations}
+    found["warm"] = arguments.warm
     if arguments.noise_only:
         found["free"] = ["noise"]
     if arguments.calibrate:
@@ -78,6 +83,25 @@ def asked(arguments: argparse.Namespace) -> dict[str, Any]:
     return found
 
 
+def hold_out(
+    runs: list[jaxekf.Recording], beside: list[str], options: dict[str, Any]
+) -> dict[str, Any]:
+    """Hold out each trial in turn, print how each variant does on it, and return all of it for JSON."""
+    found = tuning.cross_validate(
+        runs, beside=beside, start=hand_set(), progress=say_progress, **options
+    )
+    errors, nees = found.spread(), found.spread("nees")
+    print(
+        "held out in turn, mean ± deviation of a trial (worst); a filtering is one of all training trials"
+    )
+    print(f"{'':>12}{'attitude RMSE, deg':>28}{'NEES':>30}{'filterings':>12}")
+    for variant, told in errors.items():
+        texts = [f"{a.mean:.3f} ± {a.deviation:.3f} ({a.worst:.3f})" for a in (told, nees[variant])]
+        work = found.forward.get(variant, float("nan"))
+        print(f"{variant:>12}{texts[0]:>28}{texts[1]:>30}{work:>12.0f}")
+    return found.as_dict()
+
+
 def main() -> None:
     arguments = parse_arguments()
     jax.config.update("jax_enable_x64", True)
@@ -85,6 +109,9 @@ def main() -> None:
     training = load(arguments.folder, arguments.train, arguments.seed)
     testing = load(arguments.folder, arguments.test, arguments.seed)
     start = hand_set()
+    held_out = None
+    if arguments.beside is not None:
+        held_out = hold_out(training, arguments.beside, asked(arguments))
     tuned = tuning.tune(training, start=start, progress=say_progress, **asked(arguments))
     own = tuning.fit_runs(testing, tuned)
     params = [own[trial.name] for trial in testing]
@@ -119,6 +146,8 @@ def main() -> None:
     summary["optical_deg"] = float(np.rad2deg(noise.optical))
     summary["clock_offset_ms"] = 1e3 * float(calibration.clock_offset)
     summary["trials"] = arguments.test
+    if held_out is not None:
+        summary["held_out"] = held_out
     summary["seconds"] = round(time.perf_counter() - began, 1)
     print(json.dumps(summary))
 

@@ -8,7 +8,7 @@ import tuning
 from jaxekf import get_model, simulate
 from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
-from tuning import derivative_free, descent, objectives
+from tuning import consistency, derivative_free, descent, objectives
 
 
 def quadratic(x):
@@ -130,6 +130,24 @@ def test_both_lower_the_objective_of_the_tuner(runs, start, search, limit, objec
     assert found.value == pytest.approx(tuner.validation_value(found.free) + prior, rel=1e-12)
     np.testing.assert_allclose(where.to_free(found.params), found.free, atol=1e-12)
     assert (prior > 1e-7) == (objective == "map")
+
+
+def test_an_error_alone_is_rescaled_as_the_tuner_does(runs, start):
+    """Would catch covariances whose size nothing has fixed, a scale that moves the best, or a filtering for
+    it that is not counted."""
+    found = tuning.tune_by_coordinates(runs, start=start, objective="attitude", sweeps=1)
+    groups = tuning.data.prepare_groups(found.model, runs)
+    assert consistency.scale(found.model, found.params, groups, found.layout) == pytest.approx(1.0)
+    assert found.filterings == found.evaluations + 1
+    plain = tuning.tune_by_coordinates(
+        runs, start=start, objective="attitude", sweeps=1, rescale=False
+    )
+    assert plain.scale == 1.0
+    assert plain.filterings == plain.evaluations == found.evaluations
+    assert plain.value == found.value
+    factors = jax.tree.map(lambda a, b: a / b, found.params.noise, plain.params.noise)
+    np.testing.assert_allclose(jax.tree.leaves(factors), np.sqrt(found.scale), rtol=1e-12)
+    assert abs(found.scale - 1.0) > 0.05
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,15 @@
 """Noise covariances, and calibration, tuned by gradient against encoder truth or by likelihood."""
 
+from tuning.beside import BESIDE
 from tuning.data import Data, prepare
 from tuning.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
 from tuning.descent import Iteration
 from tuning.fit import Tuned, fit_runs, tune
-from tuning.folds import CrossValidation, Fold, ParameterSpread, Spread, cross_validate
+from tuning.fitted import Fitted
+from tuning.folds import CrossValidation, Fold, Limits, ParameterSpread, Spread, cross_validate
 from tuning.frame import TruthFrame
 from tuning.information import Information
+from tuning.kept import forget_folds
 from tuning.noise import Free, Layout, layout, scaled, with_axes
 from tuning.objectives import (
     Objective,
@@ -18,16 +21,20 @@ from tuning.objectives import (
 from tuning.spec import read_free
 from tuning.starts import Outcome
 from tuning.validation import Comparison, Row, compare, mean_by_variant
+from tuning.work import Work
 
 __all__ = [
+    "BESIDE",
     "Comparison",
     "CrossValidation",
     "Data",
+    "Fitted",
     "Fold",
     "Free",
     "Information",
     "Iteration",
     "Layout",
+    "Limits",
     "Objective",
     "Outcome",
     "ParameterSpread",
@@ -36,11 +43,13 @@ __all__ = [
     "Spread",
     "TruthFrame",
     "Tuned",
+    "Work",
     "attitude_error",
     "compare",
     "cross_validate",
     "evaluate",
     "fit_runs",
+    "forget_folds",
     "innovation_likelihood",
     "layout",
     "mean_by_variant",

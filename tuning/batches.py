@@ -84,6 +84,7 @@ class Batches(Descent):
     def _step(self, patience: int, progress: Progress | None) -> str:
         while len(self.history) < self.iterations:
             value = float("nan") if self.skipped else self.value(self.free)
+            self.filterings += not self.skipped
             finite = bool(np.isfinite(value))
             held = self.validation_value(self.free) if finite else float("nan")
             step = Iteration(len(self.history), value, held, not finite)
@@ -117,6 +118,7 @@ class Batches(Descent):
                 return
             change, self.memory = self.adam.update(jnp.asarray(slope), self.memory)
             self.free = self.free - self.rate * jnp.asarray(change)
+        # What fills the last batch is filtered too, but is less than a batch of each group.
         self.evaluations += 1
 
     def state_dict(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
 from tuning.noise import Layout
-from tuning.objectives import error_and_covariance, run_batch
+from tuning.objectives import Objective, error_and_covariance, run_batch
 
 
 @partial(jit, static_argnums=0)
@@ -23,6 +23,11 @@ def _nees(model: Model, every: Parameters, data: Data) -> tuple[Array, Array]:
     solved = jnp.linalg.solve(cov, error[..., None])[..., 0]
     squared = jnp.where(judged, jnp.sum(error * solved, axis=-1), 0.0)
     return jnp.sum(squared), error.shape[-1] * jnp.sum(judged)
+
+
+def is_open(objective: Objective, groups: Sequence[Data]) -> bool:
+    """Whether an objective, one of errors alone, leaves the common scale open that attitude errors fix."""
+    return not objective.likelihood and not objective.truth and "attitude" in groups[0].truth
 
 
 def scale(model: Model, params: Parameters, groups: Sequence[Data], where: Layout) -> float:

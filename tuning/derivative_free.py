@@ -5,7 +5,7 @@ Baselines to measure the tuner by, counted in evaluations of the objective: each
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +16,11 @@ from jaxekf.estimation import Run, read, require_float64
 from jaxekf.model import Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.recording import Flags, Floats
+from tuning import consistency
 from tuning.data import prepare_groups
 from tuning.descent import Descent
 from tuning.fit import starting
-from tuning.noise import Free, Layout, layout
+from tuning.noise import Free, Layout, layout, scaled
 from tuning.objectives import Objective, attitude_error, parse
 
 _FIRST_STEP = 0.1
@@ -51,8 +52,9 @@ class Found(NamedTuple):
 class Searched:
     """What came out of a tuning without gradients."""
 
+    model: Model
     params: Parameters
-    """The best; of what each run has of its own the mean. Covariances are not scaled to the errors."""
+    """The best, scaled; of what each run has of its own the mean."""
     value: float
     """The objective of `params`."""
     history: tuple[Lowered, ...]
@@ -61,7 +63,24 @@ class Searched:
     start: Parameters
     layout: Layout
     free: Floats
-    """(n,) the best free vector."""
+    """(n,) the best free vector, before the scale."""
+    scale: float = 1.0
+    """Factor by which all covariances were scaled after the search so that errors match them."""
+    filterings: int = 0
+    """Of all runs: the evaluations, and one more for the scale."""
+
+
+class Asked(TypedDict, total=False):
+    """What is searched for. Defaults and errors are those of `tune`."""
+
+    model: str | Model
+    objective: Objective | str | None
+    free: Sequence[str | Free] | None
+    start: Parameters | None
+    axes: str | None
+    burn_in_s: float
+    smooth: bool
+    rescale: bool | None
 
 
 class _Counted:
@@ -153,90 +172,25 @@ def nelder_mead(
     return counted.found()
 
 
-def tune_by_coordinates(
-    runs: Sequence[Run],
-    *,
-    model: str | Model = "loose",
-    objective: Objective | str | None = None,
-    free: Sequence[str | Free] | None = None,
-    start: Parameters | None = None,
-    axes: str | None = None,
-    burn_in_s: float = 0.0,
-    smooth: bool = False,
-    sweeps: int = 20,
-) -> Searched:
-    """Tune by `coordinate_search`; arguments, defaults and errors are those of `tune`.
-
-    Deviations start with steps of 10 % of their value, numbers below the diagonal of a full matrix with
-    10 % of their row's diagonal one, calibration with its natural unit (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
-    """
-    problem = _Problem(runs, model, objective, free, start, axes, burn_in_s, smooth)
-    relative = problem.relative
-
-    def natural(free: Floats) -> Floats:
-        return np.where(relative, np.exp(np.where(relative, free, 0.0)), free)
-
-    def back(values: Floats) -> Floats:
-        # A step of more than the whole value leads below zero: no deviation, and no finite objective.
-        admissible = np.where(relative & (values > 0.0), values, 1.0)
-        logs = np.where(values > 0.0, np.log(admissible), np.nan)
-        return np.where(relative, logs, values)
-
-    found = coordinate_search(
-        lambda values: problem.value(back(values)),
-        natural(problem.start),
-        step=problem.steps,
-        relative=relative,
-        sweeps=sweeps,
-    )
-    return problem.searched(found._replace(best=back(found.best)))
-
-
-def tune_by_nelder_mead(
-    runs: Sequence[Run],
-    *,
-    model: str | Model = "loose",
-    objective: Objective | str | None = None,
-    free: Sequence[str | Free] | None = None,
-    start: Parameters | None = None,
-    axes: str | None = None,
-    burn_in_s: float = 0.0,
-    smooth: bool = False,
-    evaluations: int = 1_000,
-) -> Searched:
-    """Tune by `nelder_mead` on the free vector, in which deviations are logarithms; arguments, defaults and
-    errors are those of `tune`. The steps of the first simplex are those of `tune_by_coordinates`."""
-    problem = _Problem(runs, model, objective, free, start, axes, burn_in_s, smooth)
-    found = nelder_mead(problem.value, problem.start, step=problem.steps, evaluations=evaluations)
-    return problem.searched(found)
-
-
-class _Problem:
+class Problem:
     """The tuner's objective as a function of the free vector, evaluated by the tuner's own program."""
 
-    def __init__(
-        self,
-        runs: Sequence[Run],
-        model: str | Model,
-        objective: Objective | str | None,
-        free: Sequence[str | Free] | None,
-        start: Parameters | None,
-        axes: str | None,
-        burn_in_s: float,
-        smooth: bool,
-    ) -> None:
+    def __init__(self, runs: Sequence[Run], **asked: Unpack[Asked]) -> None:
         require_float64()
         learnt = read(runs)
-        chosen = adapted(get_model(model), learnt)
-        aim = parse(objective) if isinstance(objective, str) else objective or attitude_error()
-        aim = replace(aim, smoothed=smooth or aim.smoothed)
-        base = starting(chosen, start, free, axes)
-        where = layout(chosen, base, free, len(learnt))
-        groups = prepare_groups(chosen, learnt, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
+        self.model = adapted(get_model(asked.get("model", "loose")), learnt)
+        told, free = asked.get("objective"), asked.get("free")
+        aim = parse(told) if isinstance(told, str) else told or attitude_error()
+        aim = replace(aim, smoothed=asked.get("smooth", False) or aim.smoothed)
+        self.base = starting(self.model, asked.get("start"), free, asked.get("axes"))
+        self.layout = layout(self.model, self.base, free, len(learnt))
+        burn_in_s = asked.get("burn_in_s", 0.0)
+        groups = prepare_groups(self.model, learnt, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
         # It is never stepped: its value is what is searched.
-        search = Descent(chosen, aim, where, base, groups, None, iterations=0)
-        self.base, self.layout = base, where
-        self.start, self.value = search.start, search.value
+        self.search = Descent(self.model, aim, self.layout, self.base, groups, None, iterations=0)
+        self.start, self.value = self.search.start, self.search.value
+        rescale = asked.get("rescale")
+        self.rescale = consistency.is_open(aim, groups) if rescale is None else rescale
 
     @property
     def relative(self) -> Flags:
@@ -250,14 +204,75 @@ class _Problem:
         linear = [leaf.kind == "linear" for leaf in self.layout.leaves for _ in range(leaf.size)]
         return np.where(linear, 1.0, _FIRST_STEP)
 
-    def searched(self, found: Found) -> Searched:
+    def by_coordinates(self, sweeps: int) -> Found:
+        """See `tune_by_coordinates`."""
+        relative = self.relative
+
+        def natural(free: Floats) -> Floats:
+            return np.where(relative, np.exp(np.where(relative, free, 0.0)), free)
+
+        def back(values: Floats) -> Floats:
+            # A step of more than the whole value leads below zero: no deviation, and no finite objective.
+            admissible = np.where(relative & (values > 0.0), values, 1.0)
+            logs = np.where(values > 0.0, np.log(admissible), np.nan)
+            return np.where(relative, logs, values)
+
+        found = coordinate_search(
+            lambda values: self.value(back(values)),
+            natural(self.start),
+            step=self.steps,
+            relative=relative,
+            sweeps=sweeps,
+        )
+        return found._replace(best=back(found.best))
+
+    def by_nelder_mead(self, evaluations: int) -> Found:
+        """See `tune_by_nelder_mead`."""
+        return nelder_mead(self.value, self.start, step=self.steps, evaluations=evaluations)
+
+    def scale(self, found: Found) -> float:
+        """By which the covariances of what was found are too small: 1 where nothing is to be scaled."""
+        if not self.rescale:
+            return 1.0
+        params = self.layout.from_free(jnp.asarray(found.best), self.base)
+        return consistency.scale(self.model, params, self.search.training, self.layout)
+
+    def searched(self, found: Found, scale: float) -> Searched:
+        """What was found as parameters."""
         params = self.layout.from_free(jnp.asarray(found.best), self.base)
         return Searched(
-            self.layout.together(params)._replace(truth=()),
-            found.value,
-            found.history,
-            found.evaluations,
-            self.base,
-            self.layout,
-            found.best,
+            model=self.model,
+            params=self.layout.together(scaled(params, scale))._replace(truth=()),
+            value=found.value,
+            history=found.history,
+            evaluations=found.evaluations,
+            start=self.base,
+            layout=self.layout,
+            free=found.best,
+            scale=scale,
+            filterings=found.evaluations + self.rescale,
         )
+
+
+def tune_by_coordinates(
+    runs: Sequence[Run], *, sweeps: int = 20, **asked: Unpack[Asked]
+) -> Searched:
+    """Tune by `coordinate_search`; the other arguments, defaults and errors are those of `tune`.
+
+    Deviations start with steps of 10 % of their value, numbers below the diagonal of a full matrix with
+    10 % of their row's diagonal one, calibration with its natural unit (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
+    """
+    problem = Problem(runs, **asked)
+    found = problem.by_coordinates(sweeps)
+    return problem.searched(found, problem.scale(found))
+
+
+def tune_by_nelder_mead(
+    runs: Sequence[Run], *, evaluations: int = 1_000, **asked: Unpack[Asked]
+) -> Searched:
+    """Tune by `nelder_mead` on the free vector, in which deviations are logarithms; the other arguments,
+    defaults and errors are those of `tune`. The steps of the first simplex are those of
+    `tune_by_coordinates`."""
+    problem = Problem(runs, **asked)
+    found = problem.by_nelder_mead(evaluations)
+    return problem.searched(found, problem.scale(found))

@@ -116,6 +116,9 @@ class Descent:
     """Of the objective with its gradient."""
     stopped: str = ""
     """Why it stopped; empty before it did."""
+    filterings: float = 0.0
+    """Of all training runs, without a gradient: for Fisher information, and of validation runs by their
+    share of the rows."""
 
     def __post_init__(self) -> None:
         self.start = on_host(self.layout.to_free(self.base))
@@ -141,6 +144,18 @@ class Descent:
         """Measured rows of the training runs."""
         return max(sum(int(visible_rows(data)) for data in self.training), 1)
 
+    @property
+    def information_cost(self) -> int:
+        """Filterings of all training runs that Fisher information takes."""
+        return 2 * len(self.layout.of_one_run().prior) + 1
+
+    @cached_property
+    def _judging_cost(self) -> float:
+        """Filterings of all training runs that as many rows are as the validation runs take."""
+        rows = sum(int(visible_rows(data)) for data in self.validation or ())
+        own = len(self.layout.own_of_one_run)
+        return (1 + (_OWN_STEPS * (2 * own + 1) if own else 0)) * rows / self._rows
+
     def _walk(self, free: Any) -> Walk:
         # Of a likelihood a small part of the mean would be a large part of what tells parameters apart.
         likely = self.objective.likelihood + self.objective.truth
@@ -151,6 +166,7 @@ class Descent:
     def _scoring(self, free: Array, gradient: Array) -> Array:
         """The step of Fisher scoring: down the gradient by the inverse of the expected curvature."""
         known = information(self.model, self.layout, free, self.base, self.training)
+        self.filterings += self.information_cost
         curved = self.objective.likelihood * known.matrix
         curved = curved + self.objective.prior * np.diag(self.layout.prior**-2.0)
         # Where nothing is known, and no prior counts, a step is short rather than endless.
@@ -205,6 +221,7 @@ class Descent:
         """The objective of the validation runs; their own parameters come from their innovations."""
         if self.validation is None:
             return float("nan")
+        self.filterings += self._judging_cost
         counts, where, plain = self.validation_counts, self.layout, on_host(free)
         if where.own:
             where, plain = self._with_own(plain)
@@ -260,6 +277,7 @@ class Descent:
         assert other.best is not None
         self.begin_at(other.best.free)
         self.evaluations += other.evaluations
+        self.filterings += other.filterings
 
     def begin_at(self, free: Any) -> None:
         """Begin elsewhere than at the start, about which the prior stays."""
@@ -346,6 +364,7 @@ class Descent:
             "rounds": np.array(self.rounds),
             "iterations": np.array(self.iterations),
             "evaluations": np.array(self.evaluations),
+            "filterings": np.array(self.filterings),
             "fixed": self.fixed,
             "stopped": np.array(self.stopped),
         }
@@ -363,6 +382,7 @@ class Descent:
         self.best = Best(kept["best_free"], self.history[int(kept["best_number"])])
         self.since, self.rounds = int(kept["since"]), int(kept["rounds"])
         self.evaluations, self.iterations = int(kept["evaluations"]), int(kept["iterations"])
+        self.filterings = float(kept["filterings"])
         self.own_free = kept.get("own_free")
         self.stopped = str(kept["stopped"])
 

@@ -22,6 +22,7 @@ from tuning import consistency, resume
 from tuning.batches import Batches
 from tuning.data import Data, prepare_groups
 from tuning.descent import Descent, Iteration, Progress, own_step
+from tuning.fitted import Fitted
 from tuning.frame import TruthFrame, no_correction
 from tuning.information import Information, information, interval, what_would_tell
 from tuning.noise import Free, Layout, layout, scaled, with_axes
@@ -64,6 +65,8 @@ class Tuned:
     """(n,) numbers that the data leave open and that stayed at their start."""
     evaluations: int = 0
     """Of the objective with its gradient, from all starts; with batches passes over all runs."""
+    filterings: float = 0.0
+    """Of all training runs, without a gradient: see `Descent.filterings`; one for the scale."""
     starts: tuple[Outcome, ...] = ()
     """What became of each start, the given one first, where there were several."""
 
@@ -169,7 +172,7 @@ def tune(
     start that is off by factors of ten and more an error alone may end on a plateau.
 
     With a `checkpoint` (a file) a tuning that was stopped, however, goes on from its last iteration when it
-    is called again with the same arguments; the file is gone when it has ended.
+    is called again with the same arguments; the file is gone when it has ended, and stays after Ctrl-C.
 
     The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when no
     likelihood is in the objective) they are scaled afterwards so that the training errors match
@@ -215,12 +218,17 @@ def tune(
     search = race.run(patience, progress)
     known, stopped = _search(search, patience, judge, progress)
     if rescale is None:
-        rescale = not aim.likelihood and not aim.truth and "attitude" in training[0].truth
+        rescale = consistency.is_open(aim, training)
     tuned = _told(search, known, stopped, _names(runs), _names(validate), rescale=rescale)
-    if checkpoint is not None:
+    if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
     if starts > 1:
-        tuned = replace(tuned, starts=race.outcomes, evaluations=race.evaluations)
+        tuned = replace(
+            tuned,
+            starts=race.outcomes,
+            evaluations=race.evaluations,
+            filterings=tuned.filterings - search.filterings + race.filterings,
+        )
     return tuned
 
 
@@ -323,6 +331,7 @@ def _told(
         information=known,
         fixed=search.fixed,
         evaluations=search.evaluations,
+        filterings=search.filterings + rescale,
     )
 
 
@@ -338,6 +347,7 @@ def _search(
         known = information(
             search.model, search.layout, search.best.free, search.base, search.training
         )
+        search.filterings += search.information_cost
         fixed = known.open(search.fixed)
         interrupted = "interrupted" in stopped
         if (fixed == search.fixed).all() or search.rounds >= _ROUNDS or interrupted:
@@ -345,11 +355,13 @@ def _search(
         search.again(fixed)
 
 
-def fit_runs(runs: Sequence[Run], tuned: Tuned, *, burn_in_s: float = 0.0) -> dict[str, Parameters]:
+def fit_runs(
+    runs: Sequence[Run], tuned: Fitted, *, burn_in_s: float = 0.0
+) -> dict[str, Parameters]:
     """Parameters of runs that were not learnt from, by name: what each has of its own is found from its own
     innovations, with the prior about the mean of the training runs; its truth is not looked at.
 
-    Where runs have nothing of their own these are `Tuned.params` for each.
+    Where runs have nothing of their own these are the `params` of what was fitted, for each.
     """
     recordings = read(runs)
     names = _names(recordings)

@@ -3,6 +3,8 @@
 import hashlib
 import io
 import zipfile
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,29 +24,31 @@ def attach(race: Race, path: Path, asked: str) -> None:
 
     `asked` is what else makes it the same. Raises `TuningError` for a file that is not, or no such file.
     """
-    mark = _mark(race.searches[0], asked)
+    mark = digest(race.searches[0], asked, race.searches[0].validation)
     if path.exists():
-        race.restore(_read(path, mark))
-
-    def keep(state: dict[str, Any]) -> None:
-        with whole_file(path, overwrite=True) as file:
-            buffer = io.BytesIO()
-            np.savez(buffer, allow_pickle=False, kind=_KIND, mark=mark, **state)
-            file.write_bytes(buffer.getvalue())
-
-    race.keep = keep
+        race.restore(read(path, mark))
+    race.keep = partial(write, path, mark)
 
 
-def _mark(search: Descent, asked: str) -> str:
-    """A digest of all that a search depends on."""
+def digest(search: Descent, asked: str, more: Any = None) -> str:
+    """Of all that a search depends on, and of more arrays."""
     told = hashlib.sha256(asked.encode())
     told.update(repr((search.model.name, search.layout, search.objective)).encode())
-    for leaf in jax.tree.leaves((search.base, search.training, search.validation)):
+    for leaf in jax.tree.leaves((search.base, search.training, more)):
         told.update(np.ascontiguousarray(leaf).tobytes())
     return told.hexdigest()
 
 
-def _read(path: Path, mark: str) -> dict[str, Any]:
+def write(path: Path, mark: str, state: Mapping[str, Any]) -> None:
+    """Write arrays by name as one file, whole or not at all."""
+    with whole_file(path, overwrite=True) as file:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, kind=_KIND, mark=mark, **state)
+        file.write_bytes(buffer.getvalue())
+
+
+def read(path: Path, mark: str) -> dict[str, Any]:
+    """What `write` wrote under the same mark. Raises `TuningError` for any other file."""
     try:
         with np.load(path, allow_pickle=False) as file:
             kept = {name: file[name] for name in file.files}

@@ -98,6 +98,11 @@ class Race:
         """Of the objective with its gradient, all searches together."""
         return sum(one.evaluations for one in self.searches)
 
+    @property
+    def filterings(self) -> float:
+        """As `Descent.filterings`, of all searches together."""
+        return sum(one.filterings for one in self.searches)
+
     def run(self, patience: int, progress: Progress | None) -> Descent:
         """Step all until one is left or all have stopped; the one with the best step."""
         try:

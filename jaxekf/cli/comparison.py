@@ -36,10 +36,12 @@ def print_comparison(
     title: str,
     rows: Sequence[tuning.Row],
     over_runs: Mapping[str, Callable[[str], dict[str, float]]] | None = None,
+    work: Mapping[str, float] | None = None,
 ) -> None:
     """The table that sets variants beside each other, run by run and below that over the runs.
 
     `over_runs` has, for each line of that kind, what tells one column by variant; their mean unless given.
+    `work` tells by variant what the line of the means has in one more column.
     """
     columns = {
         "attitude_rmse_deg": "attitude RMSE\n(deg)",
@@ -57,4 +59,9 @@ def print_comparison(
         values = {field: told(field) for field in columns}
         for variant in dict.fromkeys(row.variant for row in rows):
             shown.append([name, variant, *(values[field][variant] for field in columns)])
+    if work:
+        columns["work"] = "work\n(filterings)"
+        for row in shown:
+            known = row[0] == "mean" and row[1] in work
+            row.append(round(work[row[1]]) if known else float("nan"))
     print_table(title, ["run", "noise", *columns.values()], shown)

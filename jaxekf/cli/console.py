@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -89,8 +89,27 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
+class TuningBar:
+    """What a tuner tells its steps; `stage` says before them what they belong to."""
+
+    def __init__(self, bar: Progress, iterations: int) -> None:
+        self.bar, self.iterations, self.prefix = bar, iterations, "tuning"
+        self.task = bar.add_task("tuning: compiling", total=iterations)
+
+    def __call__(self, step: Any, total: int) -> None:
+        held = "" if step.validation != step.validation else f", validation {step.validation:.5g}"
+        told = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
+        text = f"{self.prefix}: {told}"
+        self.bar.update(self.task, completed=step.number + 1, total=total, description=text)
+
+    def stage(self, text: str) -> None:
+        """Begin anew with another description, such as ``fold 2/5``."""
+        self.prefix = text
+        self.bar.reset(self.task, total=self.iterations, description=text)
+
+
 @contextmanager
-def tuning_progress(iterations: int) -> Iterator[Callable[[Any, int], None]]:
+def tuning_progress(iterations: int) -> Iterator[TuningBar]:
     """A progress bar for the tuner on a terminal's standard error; silent in a pipe."""
     columns = (
         TextColumn("{task.description}"),
@@ -100,13 +119,4 @@ def tuning_progress(iterations: int) -> Iterator[Callable[[Any, int], None]]:
     )
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("tuning: compiling", total=iterations)
-
-        def report(step: Any, total: int) -> None:
-            held = (
-                "" if step.validation != step.validation else f", validation {step.validation:.5g}"
-            )
-            text = "rejected step" if step.rejected else f"tuning: {step.training:.5g}{held}"
-            bar.update(task, completed=step.number + 1, total=total, description=text)
-
-        yield report
+        yield TuningBar(bar, iterations)

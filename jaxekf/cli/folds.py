@@ -1,6 +1,8 @@
 """`jaxekf tune --folds`: its option, and its tables."""
 
+from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import click
@@ -8,7 +10,9 @@ import numpy as np
 
 import tuning
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
-from jaxekf.cli.console import print_table
+from jaxekf.cli.console import note, print_table, tuning_progress
+from jaxekf.recording import Recording
+from jaxekf.static_noise import read_log
 
 
 def _number(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
@@ -29,6 +33,54 @@ folds_option = click.option(
 )
 
 
+beside_option = click.option(
+    "--beside",
+    multiple=True,
+    type=click.Choice(tuning.BESIDE),
+    help="With --folds: what is judged beside the tuning, allan (the start with what the runs' rest tells),"
+    " coordinates or nelder-mead (searches without gradients), with the work of each; repeatable.",
+)
+static_option = click.option(
+    "--static",
+    type=click.Path(path_type=Path),
+    help="With --beside allan: a static log, or a run that rests, to take noise from in place of the runs'"
+    " rest.",
+)
+
+
+def check_folds(folds: int | None, beside: Sequence[str], static: Path | None) -> None:
+    """Raise `click.UsageError` for options that belong to others which are not there."""
+    if beside and folds is None:
+        raise click.UsageError(
+            f"got --beside {beside[0]} without --folds, expected folds to judge it in; add --folds all"
+        )
+    if static is not None and "allan" not in beside:
+        raise click.UsageError(
+            f"got --static {static} without --beside allan, expected what is to use it; add that, or leave"
+            " it out"
+        )
+
+
+def held_out(
+    runs: Sequence[Recording],
+    folds: int,
+    iterations: int,
+    static: Path | None,
+    **options: Any,
+) -> tuning.CrossValidation:
+    """The cross-validation that was asked for, with a progress bar; 0 folds for one for each run."""
+    with tuning_progress(iterations) as bar:
+        return tuning.cross_validate(
+            runs,
+            folds or None,
+            iterations=iterations,
+            static=None if static is None else read_log(static),
+            progress=bar,
+            stage=bar.stage,
+            **options,
+        )
+
+
 def print_folds(found: tuning.CrossValidation) -> None:
     """Held-out runs, how far they spread, and what the folds found."""
 
@@ -36,7 +88,13 @@ def print_folds(found: tuning.CrossValidation) -> None:
         return {name: getattr(spread, of) for name, spread in found.spread(column).items()}
 
     over_runs = {of: partial(told, of) for of in tuning.Spread._fields}
-    print_comparison("Held out: each run by a tuning without it", found.rows, over_runs)
+    title = "Held out: each run by a tuning without it"
+    print_comparison(title, found.rows, over_runs, found.forward)
+    if found.forward:
+        note(
+            "work is the mean over the folds, in filterings of all training runs; one with its gradient"
+            f" takes the time of {found.gradient_cost:.2f}"
+        )
     units = units_by_name(found.folds[0].tuned.model)
     rows: list[list[Any]] = []
     for name, spread in found.parameters.items():

@@ -21,7 +21,14 @@ from jaxekf.cli.console import (
     tuning_progress,
 )
 from jaxekf.cli.estimate import load_runs
-from jaxekf.cli.folds import folds_option, print_folds
+from jaxekf.cli.folds import (
+    beside_option,
+    check_folds,
+    folds_option,
+    held_out,
+    print_folds,
+    static_option,
+)
 from jaxekf.files import check_output
 from jaxekf.model import Parameters
 from jaxekf.models import get_model
@@ -135,9 +142,12 @@ from tuning.validation import as_dicts
 @click.option(
     "--state",
     type=click.Path(path_type=Path),
-    help="Keep the state of the tuning in this file after each step; if it is there, go on from it.",
+    help="Keep the state of the tuning in this file after each step; if it is there, go on from it. Folds"
+    " have files of their own beside it.",
 )
 @folds_option
+@beside_option
+@static_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
 )
@@ -166,6 +176,8 @@ def tune(
     warm: bool,
     state: Path | None,
     folds: int | None,
+    beside: tuple[str, ...],
+    static: Path | None,
     output: Path,
     overwrite: bool,
     as_json: bool,
@@ -175,19 +187,20 @@ def tune(
     --noise gives the start; the model's defaults otherwise. --folds first shows how well such a tuning does
     on runs that it has not seen.
     """
+    check_folds(folds, beside, static)
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
-    training, held_out = load_runs(runs), load_runs(validate)
+    training, judging = load_runs(runs), load_runs(validate)
     aim = parse(objective)
     asked = [*free, *(read_free(spec) if spec else ())]
     asked += [tuning.Free(name, each_run=True) for name in own]
     if aim.needs_truth:
-        for run in training + held_out:
+        for run in training + judging:
             if run.encoder is None:
                 note(f"run '{run.name}' has no encoder and does not count in the error")
     options: dict[str, Any] = {
-        "validate": held_out,
+        "validate": judging,
         "model": chosen,
         "objective": aim,
         "free": asked or None,
@@ -207,20 +220,22 @@ def tune(
     }
     unseen = None
     if folds is not None:
-        with tuning_progress(iterations) as progress:
-            unseen = tuning.cross_validate(training, folds or None, progress=progress, **options)
+        asked_beside = {"beside": beside, "static": static, "checkpoint": state}
+        unseen = held_out(training, folds, **asked_beside, **options)
         if not as_json:
             print_folds(unseen)
     with tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuned.save(output)
+    if state is not None and folds is not None and "interrupted" not in tuned.stopped:
+        tuning.forget_folds(state)
     note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
     for label, more in tuned.open.items():
         note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
-    scored = [run for run in held_out or training if run.encoder is not None]
-    rows = _compare(tuned, scored, start, bool(held_out), smooth) if scored else []
+    scored = [run for run in judging or training if run.encoder is not None]
+    rows = _compare(tuned, scored, start, bool(judging), smooth) if scored else []
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
@@ -232,7 +247,7 @@ def tune(
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        on = "validation runs" if held_out else "the training runs themselves"
+        on = "validation runs" if judging else "the training runs themselves"
         print_comparison(f"On {on}", rows)
 
 

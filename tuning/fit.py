@@ -26,7 +26,9 @@ from tuning.frame import TruthFrame, no_correction
 from tuning.information import Information, information, interval, what_would_tell
 from tuning.noise import Free, Layout, layout, scaled, with_axes
 from tuning.objectives import Objective, attitude_error, parse
+from tuning.record import JudgedOn, record, write_record
 from tuning.starts import Outcome, Race, draw, points_at_once
+from tuning.validation import Row
 
 _ROUNDS = 2
 """Times that the search goes on after something was found to be open and was fixed at its start."""
@@ -95,10 +97,11 @@ class Tuned:
         """How far each free number moved from its start, in words: the factor of a logarithm, else in
         deviations of its prior."""
         start = np.asarray(self.layout.to_free(self.start))
-        off, told, at = self.free - start, [], 0
+        told, at = [], 0
         for leaf in self.layout.leaves:
             for i in range(leaf.size):
-                change = float(off[at + i])
+                end, begin = self.free[at + i], start[at + i]
+                change = leaf.straight(end) - leaf.straight(begin)
                 if leaf.is_logarithm(i):
                     told.append(f"x {np.exp(change):.3g}")
                 else:
@@ -110,12 +113,23 @@ class Tuned:
         """The parameters of a training run, its own included."""
         return self.each.get(_name(run), self.params)
 
-    def save(self, folder: Path | str) -> None:
+    def save(
+        self,
+        folder: Path | str,
+        *,
+        rows: Sequence[Row] = (),
+        judged_on: JudgedOn | None = None,
+        folds: Any = None,
+    ) -> None:
         """Write `noise.toml` and `calibration.toml`, with units and where they came from; where runs have
-        parameters of their own also ``runs/NAME`` with the same files for each."""
+        parameters of their own also ``runs/NAME`` with the same files for each. `tuning.json` beside them
+        is for `jaxekf report`; the other arguments add to it what `tuning.save_record` says.
+        """
+        told = record(self, rows=rows, judged_on=judged_on, folds=folds)
         parameters.save(folder, self.model, self.params, self.origin)
         for name, params in self.each.items():
             parameters.save(Path(folder) / "runs" / name, self.model, params, self.origin)
+        write_record(folder, told)
 
 
 def tune(

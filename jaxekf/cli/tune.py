@@ -170,7 +170,7 @@ def tune(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Tune on RUNS and write noise.toml and calibration.toml.
+    """Tune on RUNS and write noise.toml, calibration.toml, and tuning.json for jaxekf report.
 
     --noise gives the start; the model's defaults otherwise. --folds first shows how well such a tuning does
     on runs that it has not seen.
@@ -213,7 +213,7 @@ def tune(
             print_folds(unseen)
     with tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
-    tuned.save(output)
+    tuned.save(output, folds=unseen)
     note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
@@ -221,6 +221,7 @@ def tune(
         note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
     scored = [run for run in held_out or training if run.encoder is not None]
     rows = _compare(tuned, scored, start, bool(held_out), smooth) if scored else []
+    tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}

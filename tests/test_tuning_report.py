@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import plotly.graph_objects as go
 import pytest
@@ -16,7 +17,7 @@ import jaxekf
 import tuning
 from jaxekf import simulate
 from jaxekf.cli import main
-from jaxekf.errors import TuningError
+from jaxekf.errors import RecordingError, TuningError
 from jaxekf.parameters import as_arrays
 from jaxekf.report import tuned as saved
 from jaxekf.report import tuning_figures, write_report
@@ -69,7 +70,7 @@ def found():
     labels = where.labels()
     fixed = np.array([label == "noise.bias_walk" for label in labels])
     best = np.asarray(where.to_free(start)) + np.where(fixed, 0.0, 0.1 * np.arange(len(labels)))
-    params = tuning.scaled(where.from_free(best, start), 4.0)
+    params = tuning.scaled(where.from_free(jnp.asarray(best), start), 4.0)
     known = Information(where, best, 1e4 * np.eye(len(labels)), np.zeros(len(labels)))
     names = ["run-0", "run-1"]
     history = (Iteration(0, 2.0, 3.0, False), Iteration(1, float("nan"), float("nan"), True))
@@ -397,7 +398,7 @@ def test_what_stands_in_the_tables(read):
     text = "|".join(t for t in read.text if t.strip())
     assert "A warning </script><script>throw 1</script>" in text and "b" not in read.tags
     # start, tuned, interval, unit, move and what is written, in degrees
-    assert "noise.optical|0.573|1.146|0.8594|1.719|deg|× 2|2.292" in text
+    assert "noise.optical|0.57296|1.1459|0.85944|1.7189|deg|× 2|2.2918" in text
     assert "calibration.clock_offset|0|0.001|–|–|s|+0.02 σ of the prior|0.001" in text
     assert "validation runs (held out)" in text
     assert "the training runs themselves (not held out)" in text
@@ -410,9 +411,9 @@ def test_what_stands_in_the_tables(read):
     assert "calibration.alignment[2]|0|1.719|0.0573|deg" in text
     assert "alignment|5.73  0  0|deg" in text
     # The overview takes the numbers of runs that were not learnt from, where there are any.
-    assert "0.400|0.305|1.000|0.900|1.500|1.100|2 runs held out by folds" in text
-    assert "0.500|0.300|1.100|1.000|1.500|1.000|2 validation runs" in text
-    assert "nothing speaks against it" in text
+    assert "loose|2 runs|0.400|0.305|1.000|0.900|2.625|1.125|0.200|0.900|1.500|1.100" in text
+    assert "0.500|0.300|1.100|1.000|–|–|0.200|0.900|1.500|1.000" in text
+    assert "|1.000|1.000|2 runs held out by folds|" in text and "|2 validation runs|nothing" in text
 
 
 def test_warnings_stand_before_everything_else(shown):
@@ -560,7 +561,7 @@ def test_text_that_is_no_record(tmp_path):
         made = call("report", folder, "-o", tmp_path / "r.html")
         assert made.exit_code == 1 and words in made.output and "tuning.json" in made.output
     (folder / "tuning.json").unlink()
-    with pytest.raises(jaxekf.errors.RecordingError, match=r"tuning\.json: got no such file"):
+    with pytest.raises(RecordingError, match=r"tuning\.json: got no such file"):
         saved.read_tuning(folder)
     (folder / "noise.toml").write_text("")
     made = call("report", folder, "-o", tmp_path / "r.html")

@@ -86,12 +86,12 @@ def unit_markup(unit: str) -> str:
     return text(re.sub(r"\bsqrt\((\w+)\)", r"√\1", unit).replace("^2", "²"))
 
 
-def number_markup(value: Any) -> str:
-    """A number, vector or matrix, four digits; a dash for none."""
+def number_markup(value: Any, digits: int = 4) -> str:
+    """A number, vector or matrix with so many digits; a dash for none."""
     array = np.array(value, float)
     if array.ndim == 0:
-        return "–" if np.isnan(array) else f"{float(array):.4g}"
-    lines = ["  ".join(f"{x:.4g}" for x in row) for row in np.atleast_2d(array)]
+        return "–" if np.isnan(array) else f"{float(array):.{digits}g}"
+    lines = ["  ".join(f"{x:.{digits}g}" for x in row) for row in np.atleast_2d(array)]
     return f'<span class="matrix">{text(chr(10).join(lines))}</span>'
 
 

@@ -49,26 +49,31 @@ class TuningSection(NamedTuple):
 
 def tunings_overview(sections: Sequence[TuningSection]) -> str:
     """A row of numbers and a row of warnings for each tuning."""
-    heads = ["tuning", "model", "tuned on", "attitude RMSE (deg), before", "after"]
-    heads += ["rate RMSE (deg/s), before", "after", "NEES attitude, before", "after", "mean over"]
+    judged = [section.tuning.judged for section in sections]
+    columns = [
+        (column, f"{head} ({unit})" if unit else head)
+        for column, head, unit in known_columns([row for rows, _ in judged for row in rows])
+    ]
+    heads = ["tuning", "model", "tuned on"]
+    for _, head in columns:
+        heads += [f"{head}, before", "after"]
     rows = []
-    for i, section in enumerate(sections, 1):
-        document, (judged, what) = section.tuning.document, section.tuning.judged
-        first, last = before_and_after(judged)
+    for i, (section, (compared, what)) in enumerate(zip(sections, judged, strict=True), 1):
+        document = section.tuning.document
         means = [
-            shown(spread(judged, variant, column).mean, 3)
-            for column in ("attitude_rmse_deg", "rate_rmse_deg_s", "nees")
-            for variant in (first, last)
+            shown(spread(compared, variant, column).mean, 3)
+            for column, _ in columns
+            for variant in before_and_after(compared)
         ]
         cells = [
             f'<a href="#tuning-{i}">{text(section.name)}</a>',
             text(document["model"]),
             _counted(document["runs"]),
             *means,
-            text(f"{len({row['run'] for row in judged})} {what}") if judged else "–",
+            text(f"{len({row['run'] for row in compared})} {what}") if compared else "–",
         ]
         rows.append((cells, section.warnings or [_NO_WARNING]))
-    return worded_table(heads, rows, range(3, 9))
+    return worded_table([*heads, "mean over"], rows, range(3, len(heads)))
 
 
 def tuning_markup(section: TuningSection, number: int) -> str:
@@ -210,7 +215,7 @@ def _numbers(document: Mapping[str, Any]) -> str:
         turned, unit = in_degrees(
             [number["start"], number["tuned"], *ends, number["written"]], number["unit"]
         )
-        told = [number_markup(value) for value in turned]
+        told = [number_markup(value, 5) for value in turned]
         remarks = ["left open by the data"] if number["left_open"] else []
         remarks += ["of the encoder"] if number["truth"] else []
         remarks += [f"of {number['run']} alone"] if number["run"] else []

@@ -25,6 +25,8 @@ from tuning import cautions
 from tuning.descent import Iteration
 from tuning.information import Information
 from tuning.record import record
+from tuning.starts import Outcome
+from tuning.validation import as_dicts
 
 NAME = 'free <b>&"5"'
 COLUMNS = (
@@ -91,6 +93,7 @@ def found():
         information=known,
         fixed=fixed,
         evaluations=3,
+        starts=(Outcome(2.0, 3, "converged"), Outcome(float("inf"), 0, "it could not begin")),
     )
 
 
@@ -161,6 +164,7 @@ def plain():
         "rejected_steps": 0,
         "covariance_scale": 4.0,
         "best_iteration": 2,
+        "starts": [],
         "history": [step(0, 3.0, 4.0), step(1, 2.0, 3.5), step(2, 1.0, 1.5), step(3, 0.9, 1.75)],
         "numbers": [number("noise.optical"), shift],
         "units": {"noise.optical": "rad", "calibration.clock_offset": "s"},
@@ -202,11 +206,10 @@ def test_the_record_is_the_tuning(found, rows, tmp_path):
     told = json.loads(text, parse_constant=pytest.fail)
     assert told == record(found, rows=rows)
     assert told["runs"] == ["run-0", "run-1"] and told["validation_runs"] == ["run-2"]
-    assert told["judged_on"] == "validation runs" and told["rows"] == tuning.validation.as_dicts(
-        rows
-    )
+    assert told["judged_on"] == "validation runs" and told["rows"] == as_dicts(rows)
     assert told["history"][2] == step(2, 1.0, 2.0)
     assert told["history"][1] == step(1, None, None, True) and told["rejected_steps"] == 1
+    assert told["starts"][1] == {"value": None, "iterations": 0, "ending": "it could not begin"}
     assert told["best_iteration"] == 2 and told["evaluations"] == 3
     assert told["provenance"]["versions"] == {"jax": "1"}
     numbers = {n["label"]: n for n in told["numbers"]}
@@ -370,6 +373,8 @@ def shown(runs, tmp_path_factory):
     other |= {"truth": {"alignment": {"value": [0.1, 0.0, 0.0], "unit": "rad"}}}
     other["warnings"] = ["A warning </script><script>throw 1</script>", "Another one"]
     other["covariance_scale"] = 1.0
+    other["starts"] = [{"value": None, "iterations": 0, "ending": "lost"}]
+    other["starts"] += [{"value": 1.5, "iterations": 7, "ending": "won"}]
     write(folder / "tuned", other)
     given = [folder / "tuned", folder / "result", folder / NAME, folder / "result" / ".." / "tuned"]
     made = call("report", *given, folder / "result", "-o", folder / "r.html", "--json")
@@ -400,6 +405,7 @@ def test_what_stands_in_the_tables(read):
     # start, tuned, interval, unit, move and what is written, in degrees
     assert "noise.optical|0.57296|1.1459|0.85944|1.7189|deg|× 2|2.2918" in text
     assert "calibration.clock_offset|0|0.001|–|–|s|+0.02 σ of the prior|0.001" in text
+    assert "as given|–|0|lost|drawn 1|1.5|7|won" in text
     assert "validation runs (held out)" in text
     assert "the training runs themselves (not held out)" in text
     assert f"{NAME}|start|0.400|1.000|0.200|1.500|" in text

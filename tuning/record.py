@@ -53,7 +53,8 @@ def record(
     they are, and is told by their names unless given. `folds` come from `cross_validate`. ``numbers`` holds
     each free number: ``tuned`` and ``interval`` (95 %) before the common scale of all covariances,
     ``written`` as it stands in the parameter files; ``change`` is a factor for logarithms, else in
-    deviations of the prior. ``history`` has the values of the objective, step by step.
+    deviations of the prior. ``history`` has the values of the objective, step by step, of
+    the best of several ``starts``.
 
     Raises `TuningError` where `judged_on` contradicts the names of the runs.
     """
@@ -82,6 +83,7 @@ def record(
             for step in tuned.history
         ],
         "best_iteration": int(tuned.best.number),
+        "starts": [outcome._asdict() for outcome in tuned.starts],
         "numbers": _numbers(tuned),
         "units": _units(tuned),
         "truth": _truth(tuned),

@@ -225,7 +225,6 @@ def tune(
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
-        document["starts"] = [one._asdict() for one in tuned.starts]
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
@@ -252,7 +251,7 @@ def _compare(
 
 
 def _known(tuned: tuning.Tuned) -> dict[str, Any]:
-    """Intervals, what was left open, what each run has of its own and the truth's frame, for JSON."""
+    """For JSON: intervals, what was left open, starts, what each run has of its own, the truth's frame."""
     each = {name: parameters.to_document(tuned.model, p, {}) for name, p in tuned.each.items()}
     truth = None
     if tuned.truth is not None:
@@ -260,6 +259,7 @@ def _known(tuned: tuning.Tuned) -> dict[str, Any]:
     return {
         "intervals": {label: list(ends) for label, ends in tuned.intervals.items()},
         "left_open": tuned.open,
+        "starts": [one._asdict() for one in tuned.starts],
         "truth": truth,
         "own": {
             name: {k: told[k] for k in ("noise", "calibration")} for name, told in each.items()

@@ -151,6 +151,7 @@ _RECORD = {
     "rejected_steps": _number,
     "covariance_scale": _number,
     "best_iteration": _number,
+    "starts": [{"value": _maybe(_number), "iterations": _number, "ending": _text}],
     "history": [
         {
             "number": _number,

@@ -70,10 +70,15 @@ def tunings_overview(sections: Sequence[TuningSection]) -> str:
             text(document["model"]),
             _counted(document["runs"]),
             *means,
-            text(f"{len({row['run'] for row in compared})} {what}") if compared else "–",
+            text(_mean_over(compared, what)) if compared else "–",
         ]
         rows.append((cells, section.warnings or [_NO_WARNING]))
     return worded_table([*heads, "mean over"], rows, range(3, len(heads)))
+
+
+def _mean_over(rows: Sequence[dict[str, Any]], what: str) -> str:
+    count = len({row["run"] for row in rows})
+    return f"{count} {what.replace('runs', 'run', 1) if count == 1 else what}"
 
 
 def tuning_markup(section: TuningSection, number: int) -> str:
@@ -94,6 +99,7 @@ def tuning_markup(section: TuningSection, number: int) -> str:
         if section.warnings
         else listed([_NO_WARNING]),
         drawn.get("search", ""),
+        _starts(document),
     ]
     if document["rows"]:
         parts += [
@@ -116,6 +122,25 @@ def tuning_markup(section: TuningSection, number: int) -> str:
         "</section>",
     ]
     return "\n".join(part for part in parts if part)
+
+
+def _starts(document: Mapping[str, Any]) -> str:
+    """What became of each of several starts."""
+    if not document["starts"]:
+        return ""
+    rows = []
+    for i, one in enumerate(document["starts"]):
+        name = "as given" if i == 0 else f"drawn {i}"
+        value = number_markup(one["value"], 6)
+        rows.append([name, value, str(one["iterations"]), text(one["ending"])])
+    heads = ["start", "best value", "iterations", "ended by"]
+    note = ""
+    if any(number["left_open"] for number in document["numbers"]):
+        note = (
+            '<p class="faint">What the data leave open went back to its start in the search that won, and'
+            " its value is the one after that.</p>"
+        )
+    return f"<h3>Starts</h3>{note}{table(heads, rows, (1, 2))}"
 
 
 def _facts(tuning: SavedTuning) -> str:

@@ -18,6 +18,7 @@ from tuning.objectives import (
     innovation_likelihood,
     rate_error,
 )
+from tuning.record import save_record
 from tuning.spec import read_free
 from tuning.starts import Outcome
 from tuning.validation import Comparison, Row, compare, mean_by_variant
@@ -56,6 +57,7 @@ __all__ = [
     "prepare",
     "rate_error",
     "read_free",
+    "save_record",
     "scaled",
     "tune",
     "tune_by_coordinates",

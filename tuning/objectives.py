@@ -83,6 +83,11 @@ class Objective:
         return " + ".join(terms) + (", smoothed" if self.smoothed else "")
 
     @property
+    def errors_alone(self) -> bool:
+        """Whether no likelihood counts, so that the scale of all covariances and much else is flat."""
+        return bool(self.errors) and not self.likelihood and not self.truth
+
+    @property
     def needs_truth(self) -> bool:
         """Whether an encoder is needed."""
         return bool(self.errors) or self.truth > 0.0

@@ -75,6 +75,12 @@ class Race:
             i for i, one in enumerate(self.searches) if i not in self.dropped and not one.stopped
         ]
 
+    def warm(self, steps: int) -> None:
+        """As `Descent.warm`, for each that has not begun."""
+        for search in self.searches:
+            if not search.history:
+                search.warm(steps)
+
     @property
     def _leader(self) -> int:
         return min(range(len(self.searches)), key=self._reached)
@@ -192,3 +198,16 @@ class Race:
             own = {k.removeprefix(mine): v for k, v in kept.items() if k.startswith(mine)}
             if own:
                 search.restore(own)
+
+
+def line_up(make: Callable[..., Descent], count: int, seed: int) -> Race:
+    """Searches of one problem, which `make` gives for a `width`, from the given start and drawn ones."""
+    first = make(width=1)
+    width = points_at_once(first.training, count)
+    searches = [make(width=width) for _ in range(count)] if width > 1 else [first]
+    searches += [make() for _ in range(count - len(searches))]
+    for search, point in zip(
+        searches[1:], draw(first.layout, first.start, count, seed)[1:], strict=True
+    ):
+        search.begin_at(point)
+    return Race(searches)

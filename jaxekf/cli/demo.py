@@ -59,7 +59,7 @@ def demo(output: Path, as_json: bool) -> None:
     compared = tuning.compare(model, testing, {"hand-set": hand_set, "tuned": tuned.params})
     figures = []
     with whole_folder(output, "demo.json", overwrite=True) as folder:
-        tuned.save(folder)
+        tuned.save(folder, rows=compared.rows)
         for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
             found = diagnose(made, recording).as_dict(curves=True)
             made.save(folder / "result" / recording.name, diagnosis=found)

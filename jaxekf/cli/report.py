@@ -1,4 +1,4 @@
-"""`jaxekf report`: one HTML page of results."""
+"""`jaxekf report`: one HTML page of results and tunings."""
 
 from pathlib import Path
 
@@ -20,10 +20,11 @@ from jaxekf.report import write_report
 @overwrite_option
 @json_option
 def report(results: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
-    """Show RESULTS, folders written by jaxekf estimate, in one HTML file that needs no network.
+    """Show RESULTS, folders written by jaxekf estimate or jaxekf tune, in one HTML file without network.
 
-    Estimates with their bands beside tracker, gyroscope and encoder, biases, innovations, what became of
-    every sample, and the verdicts. Recordings are looked for where they were when they were estimated.
+    Of estimates: their bands beside tracker, gyroscope and encoder, biases, innovations, what became of
+    every sample, and the verdicts; recordings are looked for where they were when they were estimated. Of
+    tunings: what speaks against them, the search, runs before and after, parameters and folds.
     """
     made = write_report(results, output, overwrite=overwrite)
     for name, missing in zip(made.runs, made.missing, strict=True):
@@ -34,7 +35,12 @@ def report(results: tuple[Path, ...], output: Path, overwrite: bool, as_json: bo
         runs = [
             {"name": name, "result": str(folder), "recording_missing": missing, **row._asdict()}
             for name, folder, row, missing in zip(
-                made.runs, results, made.summaries, made.missing, strict=True
+                made.runs, made.folders, made.summaries, made.missing, strict=True
             )
         ]
-        print_json({"report": str(made.path), "bytes": made.size, "runs": runs})
+        tunings = [
+            {"name": each.name, "tuned": str(each.tuning.folder), "warnings": each.warnings}
+            for each in made.tunings
+        ]
+        document = {"report": str(made.path), "bytes": made.size, "runs": runs}
+        print_json(document | {"tunings": tunings})

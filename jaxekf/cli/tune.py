@@ -33,11 +33,11 @@ from jaxekf.files import check_output
 from jaxekf.model import Parameters
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
-from tuning.fit import OPTIMISERS
 from tuning.noise import AXES
 from tuning.objectives import parse
 from tuning.spec import read_free
 from tuning.validation import as_dicts
+from tuning.ways import OPTIMISERS
 
 
 @click.command()
@@ -135,9 +135,10 @@ from tuning.validation import as_dicts
     help="Tell what the data determine, with 95 % intervals; what they leave open stays at its start.",
 )
 @click.option(
-    "--warm",
-    is_flag=True,
-    help="Begin with some steps on the likelihood: for starts that are off by factors of ten and more.",
+    "--warm/--no-warm",
+    default=None,
+    help="Begin with some steps on the likelihood, for errors are flat far from their minimum.  [default:"
+    " where the objective is of errors alone]",
 )
 @click.option(
     "--state",
@@ -173,7 +174,7 @@ def tune(
     rescale: bool | None,
     smooth: bool,
     judge: bool,
-    warm: bool,
+    warm: bool | None,
     state: Path | None,
     folds: int | None,
     beside: tuple[str, ...],
@@ -182,7 +183,7 @@ def tune(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Tune on RUNS and write noise.toml and calibration.toml.
+    """Tune on RUNS and write noise.toml, calibration.toml, and tuning.json for jaxekf report.
 
     --noise gives the start; the model's defaults otherwise. --folds first shows how well such a tuning does
     on runs that it has not seen.
@@ -195,10 +196,9 @@ def tune(
     aim = parse(objective)
     asked = [*free, *(read_free(spec) if spec else ())]
     asked += [tuning.Free(name, each_run=True) for name in own]
-    if aim.needs_truth:
-        for run in training + judging:
-            if run.encoder is None:
-                note(f"run '{run.name}' has no encoder and does not count in the error")
+    for run in training + judging if aim.needs_truth else ():
+        if run.encoder is None:
+            note(f"run '{run.name}' has no encoder and does not count in the error")
     options: dict[str, Any] = {
         "validate": judging,
         "model": chosen,
@@ -216,7 +216,7 @@ def tune(
         "rescale": rescale,
         "smooth": smooth,
         "judge": judge,
-        "warm": warm,
+        "warm": aim.errors_alone and optimiser != "adam" if warm is None else warm,
     }
     unseen = None
     if folds is not None:
@@ -226,20 +226,16 @@ def tune(
             print_folds(unseen)
     with tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
-    tuned.save(output)
+    tuned.save(output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
         tuning.forget_folds(state)
-    note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
-    if tuned.rejections:
-        note(f"{tuned.rejections} steps were not finite and were rejected")
-    for label, more in tuned.open.items():
-        note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
+    _note(tuned, output)
     scored = [run for run in judging or training if run.encoder is not None]
     rows = _compare(tuned, scored, start, bool(judging), smooth) if scored else []
+    tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
         document |= {"rows": as_dicts(rows), "rejected_steps": tuned.rejections}
-        document["starts"] = [one._asdict() for one in tuned.starts]
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
@@ -247,8 +243,16 @@ def tune(
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        on = "validation runs" if judging else "the training runs themselves"
-        print_comparison(f"On {on}", rows)
+        print_comparison(f"On {'validation runs' if judging else 'the training runs'}", rows)
+
+
+def _note(tuned: tuning.Tuned, output: Path) -> None:
+    """Where it is, how it ended, and what to know of it."""
+    note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
+    if tuned.rejections:
+        note(f"{tuned.rejections} steps were not finite and were rejected")
+    for label, more in tuned.open.items():
+        note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
 
 
 def _compare(
@@ -266,7 +270,7 @@ def _compare(
 
 
 def _known(tuned: tuning.Tuned) -> dict[str, Any]:
-    """Intervals, what was left open, what each run has of its own and the truth's frame, for JSON."""
+    """For JSON: intervals, what was left open, starts, what each run has of its own, the truth's frame."""
     each = {name: parameters.to_document(tuned.model, p, {}) for name, p in tuned.each.items()}
     truth = None
     if tuned.truth is not None:
@@ -274,6 +278,7 @@ def _known(tuned: tuning.Tuned) -> dict[str, Any]:
     return {
         "intervals": {label: list(ends) for label, ends in tuned.intervals.items()},
         "left_open": tuned.open,
+        "starts": [one._asdict() for one in tuned.starts],
         "truth": truth,
         "own": {
             name: {k: told[k] for k in ("noise", "calibration")} for name, told in each.items()

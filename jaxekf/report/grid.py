@@ -22,7 +22,7 @@ PALETTE = {
 """Each colour of the figures, and what stands for it on a dark screen."""
 ESTIMATED = "estimate"
 SHADE = "rgba(128,128,128,0.24)"
-_LINES = "rgba(128,128,128,0.28)"
+LINES = "rgba(128,128,128,0.28)"
 _MOST_SHADES = 200
 _ROW_GAP = 0.045
 _TOP, _BOTTOM = 40, 44
@@ -67,9 +67,9 @@ class Grid:
             "anchor": self._x(at),
             "domain": [round(max(top - height, 0.0), 5), round(top, 5)],
             "title": {"text": title, "standoff": 6, "font": {"size": 11}},
-            "gridcolor": _LINES,
-            "zerolinecolor": _LINES,
-            "linecolor": _LINES,
+            "gridcolor": LINES,
+            "zerolinecolor": LINES,
+            "linecolor": LINES,
             "nticks": 6,
         }
         if limits is not None:
@@ -209,18 +209,10 @@ class Grid:
         """Data and layout, as Plotly takes them but for bands and the columns' places (`page.html`)."""
         if self._banded:
             self.key("2σ of the estimate", ESTIMATE, opacity=0.3)
-        layout: dict[str, Any] = {
-            "height": self._height,
-            "margin": {"l": 64, "r": 16, "t": _TOP, "b": _BOTTOM},
-            "paper_bgcolor": "rgba(0,0,0,0)",
-            "plot_bgcolor": "rgba(0,0,0,0)",
-            "font": {"family": "system-ui, sans-serif", "size": 12, "color": TRUTH},
+        shares = [column.share for column in self._columns]
+        layout = common_layout(self._height, shares) | {
             "hovermode": "x unified",
-            "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#8a8d94", "activecolor": MEASURED},
-            "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
             "shapes": self._shapes,
-            # The page sets the columns side by side, by its width.
-            "meta": {"shares": [c.share for c in self._columns], "height": self._height},
             **self._axes,
         }
         for i, column in enumerate(self._columns):
@@ -229,9 +221,9 @@ class Grid:
                 "anchor": self._y(Place(lowest, i)),
                 "range": rounded_pair(column.range),
                 "title": {"text": column.title, "standoff": 6},
-                "gridcolor": _LINES,
-                "zerolinecolor": _LINES,
-                "linecolor": _LINES,
+                "gridcolor": LINES,
+                "zerolinecolor": LINES,
+                "linecolor": LINES,
                 "hoverformat": ".3f",
                 "unifiedhovertitle": {"text": "%{x} s"},
             }
@@ -273,6 +265,26 @@ class Grid:
     def _y(self, at: Place) -> str:
         number = self._number(at)
         return "y" if number == 1 else f"y{number}"
+
+
+def common_layout(height: int, shares: Sequence[float] = (1.0,)) -> dict[str, Any]:
+    """What looks alike in every figure; the page sets columns of these `shares` side by side."""
+    return {
+        "height": height,
+        "margin": {"l": 64, "r": 16, "t": _TOP, "b": _BOTTOM},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": TRUTH},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#8a8d94", "activecolor": MEASURED},
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
+        "meta": {"shares": list(shares), "height": height},
+    }
+
+
+def axis_style(title: str) -> dict[str, Any]:
+    """Title and lines of an axis of a figure that is no `Grid`."""
+    lines = {"gridcolor": LINES, "zerolinecolor": LINES, "linecolor": LINES}
+    return {"title": {"text": title, "standoff": 6, "font": {"size": 11}}, **lines}
 
 
 def rounded_pair(limits: tuple[float, float]) -> list[float]:

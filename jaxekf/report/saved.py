@@ -17,6 +17,8 @@ from jaxekf.storage import SCHEMA_VERSION
 from jaxekf.tables import numbers, read_table, read_times
 
 _AGAIN = "estimating the run again with this version of jaxekf"
+_KINDS = ("result.json", "tuning.json")
+_EXPECTED = "a result folder of jaxekf estimate or a tuned folder of jaxekf tune"
 _AXES = ("x", "y", "z")
 _NEEDED: Mapping[str, type | tuple[type, ...]] = {
     "run": str,
@@ -155,15 +157,14 @@ def _read_document(folder: Path) -> dict[str, Any]:
     """`result.json`, of a version and kind that is known."""
     file = folder / "result.json"
     if not folder.is_dir():
-        raise RecordingError(
-            folder, "no such folder", "a result folder of jaxekf estimate", "another path"
-        )
+        raise RecordingError(folder, "no such folder", _EXPECTED, "another path")
     if not file.is_file():
-        inner = sorted(path.parent.name for path in folder.glob("*/result.json"))
+        files = [path for kind in _KINDS for path in folder.glob(f"*/{kind}")]
+        inner = sorted({path.parent.name for path in files})
         hint = f"the folders in it ({', '.join(inner[:3])})" if inner else "another path"
-        raise RecordingError(
-            folder, "a folder without result.json", "a result folder of jaxekf estimate", hint
-        )
+        if (folder / "noise.toml").is_file():
+            hint = "tuning again with this version of jaxekf, if it was tuned"
+        raise RecordingError(folder, f"a folder without {' or '.join(_KINDS)}", _EXPECTED, hint)
     try:
         document = json.loads(file.read_text("utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -1,11 +1,14 @@
 """Simulated runs of a tracker and a gyroscope as plain arrays, and their layouts as steps."""
 
+import os
+from collections.abc import Collection, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxekf import ekf, jit, kernels
@@ -13,6 +16,19 @@ from jaxekf.model import Parameters
 from jaxekf.models import loose, loose_additive, loose_rate, tight
 from jaxekf.recording import Imu, Markers, Optical, Recording, from_scipy
 from jaxekf.timeline import Knots, Rows, Steps
+
+LONG = os.environ.get("JAXEKF_LONG") == "1"
+
+
+def long_form(values: Sequence[Any], only_long: Collection[Any]) -> list[Any]:
+    """Parameters of a test, of which some are left to the long form: each takes the compiler half a minute
+    and goes the way of another."""
+    mark = pytest.mark.skipif(not LONG, reason="long form: set JAXEKF_LONG=1")
+    return [
+        pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=mark) if v in only_long else v
+        for v in values
+    ]
+
 
 ARMS = tight.L_SHAPE
 BIAS = np.array([0.02, -0.015, 0.01])

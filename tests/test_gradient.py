@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenario
 
 from jaxekf import get_model, jit, simulate, simulate_tool
 from jaxekf.models import REGISTRY
@@ -124,7 +125,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", scenario.long_form(NAMES, {"loose_rate", "loose_additive"}))
 def test_gradient_matches_central_differences(name, case):
     model = get_model(name)
     data = CASES[case](model)

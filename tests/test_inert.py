@@ -56,7 +56,7 @@ def assert_identical(actual, expected):
     jax.tree.map(np.testing.assert_array_equal, actual, expected)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", scenario.long_form(NAMES, {"loose_rate"}))
 def test_masked_values_are_inert(name):
     """A hidden NaN or huge number that reaches an output, or a gradient by the branch not taken."""
     _, params, first, steps, truth = prepared(name)

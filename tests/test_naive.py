@@ -47,7 +47,9 @@ def weighted(found, seed):
     )
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", scenario.long_form(list(MODELS), {"loose_pose", "loose_rate", "markers"})
+)
 def test_fast_is_naive(name):
     """Structure found that is not there, a block of rows taken wrongly, a cotangent lost: by a fast path
     that its own slow path shares."""

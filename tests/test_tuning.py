@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import scenario
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,11 +46,10 @@ def start_at(factor):
 
 @pytest.mark.parametrize(
     ("objective", "factor"),
-    [
-        (tuning.innovation_likelihood(), 10.0),
-        (tuning.attitude_error(), 10.0),
-    ],
-    ids=["likelihood from 10x", "error from 10x"],
+    scenario.long_form(
+        [(tuning.innovation_likelihood(), 10.0), (tuning.attitude_error(), 10.0)],
+        [(tuning.attitude_error(), 10.0)],
+    ),
 )
 def test_planted_noise_is_found(planted, objective, factor):
     """Would catch a wrong gradient, a density that depends on the rate, or a tuner that gives up."""

@@ -288,6 +288,18 @@ def test_information_is_the_curvature(runs, tuned):
     # At the maximum the score is the prior's pull.
     pull = tuned.information.score - (free - search.start) / tuned.layout.prior**2
     assert np.abs(pull[kept] / size).max() < 0.2
+    # Fisher scoring takes value and gradient from the runs of the filter that its curvature takes anyway.
+    at = free + 0.3 * np.cos(np.arange(len(free)))
+    scoring = Descent(
+        MODEL, tuned.objective, tuned.layout, tuned.start, groups, None, 1, fisher=True
+    )
+    scoring.fixed = tuned.fixed
+    (value, gradient), (again, score) = (
+        search.value_and_gradient(at),
+        scoring.value_and_gradient(at),
+    )
+    assert again == pytest.approx(value, rel=1e-9)
+    np.testing.assert_allclose(score, gradient, rtol=1e-4, atol=1e-5 * np.abs(gradient).max())
 
 
 def test_fisher_scoring_goes_to_the_same_place(runs, tuned):

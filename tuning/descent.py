@@ -16,7 +16,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Flags, Floats
 from tuning.data import Data
-from tuning.information import information, of_runs
+from tuning.information import Information, information, of_runs
 from tuning.noise import Layout
 from tuning.objectives import Objective, count, evaluate_each, visible_rows, weights_of
 from tuning.walk import Walk
@@ -113,7 +113,7 @@ class Descent:
     history: list[Iteration] = field(default_factory=list)
     rounds: int = 0
     evaluations: int = 0
-    """Of the objective with its gradient."""
+    """Of the objective with its gradient; Fisher scoring takes none."""
     stopped: str = ""
     """Why it stopped; empty before it did."""
     filterings: float = 0.0
@@ -128,6 +128,7 @@ class Descent:
         self.since = 0
         self.own_free: Floats | None = None
         self.fallback: Best | None = None
+        self._known: Information | None = None
 
     @cached_property
     def training_counts(self) -> dict[str, Array]:
@@ -165,8 +166,10 @@ class Descent:
 
     def _scoring(self, free: Array, gradient: Array) -> Array:
         """The step of Fisher scoring: down the gradient by the inverse of the expected curvature."""
-        known = information(self.model, self.layout, free, self.base, self.training)
-        self.filterings += self.information_cost
+        known = self._known
+        if known is None or not np.array_equal(known.free, on_host(free)):
+            known = information(self.model, self.layout, free, self.base, self.training)
+            self.filterings += self.information_cost
         curved = self.objective.likelihood * known.matrix
         curved = curved + self.objective.prior * np.diag(self.layout.prior**-2.0)
         # Where nothing is known, and no prior counts, a step is short rather than endless.
@@ -180,12 +183,27 @@ class Descent:
     def value_and_gradient(self, free: Any) -> tuple[float, Array]:
         """The objective of the training runs, prior included."""
         plain = on_host(free)
+        if self.fisher:
+            return self._value_and_score(plain)
         if self.width > 1:
             return self.completed(plain, *self.plain_values_and_gradients([plain])[0])
         given = self.model, self.objective, self.layout, plain, self.base
         found = [_value_and_gradient(*given, data, self.training_counts) for data in self.training]
         gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
         return self.completed(plain, sum(float(value) for value, _ in found), gradient)
+
+    def _value_and_score(self, free: Floats) -> tuple[float, Array]:
+        """The same by the filter alone, from the runs of it that the curvature takes anyway: the gradient
+        of a large model takes the compiler longer than all the steps of Fisher scoring."""
+        value = self.value(free)
+        self.filterings += 1
+        if not np.isfinite(value):
+            return value, jnp.zeros(len(free))
+        self._known = information(self.model, self.layout, free, self.base, self.training)
+        self.filterings += self.information_cost
+        slope = -self.objective.likelihood * self._known.score / self._rows
+        slope = np.where(self.fixed, 0.0, slope + self._prior(free)[1])
+        return value, jnp.asarray(slope)
 
     def plain_values_and_gradients(self, points: Sequence[Floats]) -> list[tuple[float, Floats]]:
         """Of up to `width` points at once, without the prior."""

@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -99,16 +100,18 @@ def of_runs(
     With `chosen` only some of the numbers are told of.
     """
     flat = where.of_one_run()
-    tell = partial(_innovations, model, flat, base=base, data=data)
-    middle = jax.tree.map(np.asarray, tell(local))
+
+    def tell(local: Floats) -> tuple[dict[str, Any], Floats]:
+        return jax.tree.map(np.asarray, _innovations(model, flat, local, base=base, data=data))
+
+    middle, _ = tell(local)
     white, spread, gain = [], [], []
     factors = {name: np.linalg.inv(np.linalg.cholesky(cov)) for name, (_, cov, _) in middle.items()}
-    now = {name: _apply(factors[name], residual) for name, (residual, _, _) in middle.items()}
     for i in range(local.shape[1]) if chosen is None else chosen:
         step = np.zeros(local.shape[1])
         step[i] = _STEP
-        ahead, behind = (jax.tree.map(np.asarray, tell(local + sign * step)) for sign in (1, -1))
-        first, second, slope = [], [], np.zeros(len(local))
+        (ahead, higher), (behind, lower) = tell(local + step), tell(local - step)
+        first, second = [], []
         for name, (_, _, used) in middle.items():
             both = used & ahead[name][2] & behind[name][2]
             moved = (ahead[name][0] - behind[name][0]) / (2.0 * _STEP) * both
@@ -116,15 +119,11 @@ def of_runs(
             grown = grown * both[..., None] * both[..., None, :]
             a = _apply(factors[name], moved)
             b = factors[name] @ grown @ np.swapaxes(factors[name], -1, -2)
-            e = now[name]
-            each = -np.sum(a * e, axis=-1) - 0.5 * np.trace(b, axis1=-2, axis2=-1)
-            each = each + 0.5 * np.einsum("...i,...ij,...j->...", e, b, e)
-            slope += each.reshape(len(local), -1).sum(axis=1)
             first.append(a.reshape(len(local), -1))
             second.append(b.reshape(len(local), -1))
         white.append(np.concatenate(first, axis=1))
         spread.append(np.concatenate(second, axis=1))
-        gain.append(slope)
+        gain.append((higher - lower) / (2.0 * _STEP))
     a, b = np.stack(white, axis=1), np.stack(spread, axis=1)
     found = a @ a.transpose(0, 2, 1) + 0.5 * b @ b.transpose(0, 2, 1)
     return found, np.stack(gain, axis=1)
@@ -137,8 +136,8 @@ def _apply(factor: Floats, vectors: Floats) -> Floats:
 @partial(jit, static_argnums=(0, 1))
 def _innovations(
     model: Model, flat: Layout, local: Array, *, base: Parameters, data: Data
-) -> dict[str, tuple[Array, Array, Array]]:
-    """Residual, covariance and what was used of each sensor past the burn-in."""
+) -> tuple[dict[str, tuple[Array, Array, Array]], Array]:
+    """Residual, covariance and what was used of each sensor past the burn-in, and each run's likelihood."""
     every = jax.vmap(partial(flat.from_free, base=base._replace(setup=())))(local)
     output = run_batch(model, every._replace(setup=data.setup), data, "everything")
     found = {}
@@ -146,7 +145,8 @@ def _innovations(
         counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
         used = told.used & counted[..., None]
         found[name] = (told.residual, told.cov, used)
-    return found
+    likelihood = jnp.where(data.counted, output.instants.log_likelihood, 0.0)
+    return found, jnp.sum(likelihood, axis=(1, 2))
 
 
 _MORE = {

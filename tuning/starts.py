@@ -203,7 +203,7 @@ class Race:
 def line_up(make: Callable[..., Descent], count: int, seed: int) -> Race:
     """Searches of one problem, which `make` gives for a `width`, from the given start and drawn ones."""
     first = make(width=1)
-    width = points_at_once(first.training, count)
+    width = 1 if first.fisher else points_at_once(first.training, count)
     searches = [make(width=width) for _ in range(count)] if width > 1 else [first]
     searches += [make() for _ in range(count - len(searches))]
     for search, point in zip(

@@ -11,6 +11,7 @@ import tuning
 from jaxekf import simulate
 from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
+from tuning import batches
 from tuning import starts as starting
 from tuning.batches import Batches, cut
 from tuning.data import prepare_groups
@@ -173,12 +174,45 @@ def test_each_pass_takes_every_run(runs):
     """Would catch runs that are left out of a pass, and an order that is always the same."""
     data = prepare_groups(MODEL, runs, need_truth=False)[0]
     rng = np.random.default_rng(0)
-    orders = [cut(data, 2, rng) for _ in range(5)]
+    orders = [[batch.chosen for batch in cut(data, 2, rng)] for _ in range(5)]
     for order in orders:
         assert [len(batch) for batch in order] == [2, 2]
         assert set(np.concatenate(order)) == {0, 1, 2}
     assert len({tuple(np.concatenate(order)) for order in orders}) > 1
-    assert [len(batch) for batch in cut(data, 16, rng)] == [3]
+    assert [len(batch.chosen) for batch in cut(data, 16, rng)] == [3]
+
+
+def test_the_batches_of_a_pass_are_all_runs(runs, start):
+    """Would catch a run that counts twice because it fills a batch, and batches weighted otherwise than by
+    their rows: Adam would end elsewhere than at the minimum for all runs."""
+    where = layout(MODEL, start, OPTIONS["free"])
+    groups = prepare_groups(MODEL, runs, need_truth=False)
+    search = Batches(MODEL, tuning.innovation_likelihood(), where, start, groups, None, 3, size=2)
+    search.free = search.free + 0.3
+    parts = cut(groups[0], 2, np.random.default_rng(0))
+    each = [search.slope(groups[0], batch, len(parts)) for batch in parts]
+    whole = np.asarray(search.value_and_gradient(search.free)[1])
+    np.testing.assert_allclose(np.mean(each, axis=0), whole, rtol=1e-8)
+    assert np.abs(each[0] - whole).max() > 1e-3 * np.abs(whole).max()
+
+
+def test_goes_on_in_the_middle_of_a_pass(runs, start, monkeypatch):
+    """Would catch a pass that begins again after a stop, or whose beginning is judged twice."""
+    where = layout(MODEL, start, OPTIONS["free"])
+    groups = prepare_groups(MODEL, runs, need_truth=False)
+    given = MODEL, tuning.innovation_likelihood(), where, start, groups, None, 4
+    whole = Batches(*given, size=2)
+    whole.run(15, None)
+    monkeypatch.setattr(batches, "KEEP_S", -1.0)
+    kept = []
+    stopped = Batches(*given, size=2, keep=lambda state: kept.append(state))
+    stopped.run(15, None)
+    middle = next(state for state in kept[2:] if state["batches_done"] == 1)
+    again = Batches(*given, size=2)
+    again.restore(middle)
+    again.run(15, None)
+    np.testing.assert_array_equal(again.free, whole.free)
+    assert str(again.history) == str(whole.history)
 
 
 def test_a_pass_that_fails_is_repeated_from_the_best(runs, start):

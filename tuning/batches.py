@@ -1,8 +1,9 @@
 """Adam on a few runs at a time: for so many recorded runs that one pass over all of them is long."""
 
+import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxekf.recording import Floats
 from tuning.data import Data
 from tuning.descent import Descent, Iteration, Progress, evaluate_at, on_host
 from tuning.noise import Layout
-from tuning.objectives import Objective, count, weights_of
+from tuning.objectives import Objective
 
 RATE = 0.1
 """Of Adam at first: about as much as each free number moves in a step, a tenth of an e-fold."""
@@ -24,7 +25,9 @@ _STALE = 2
 """Passes without improvement after which the rate is halved."""
 _LEAST_RATE = 1e-3
 """Share of the first rate at which it has converged."""
-_KEPT = ("free", "rate", "skipped", "halved")
+_KEPT = ("free", "rate", "skipped", "halved", "done")
+KEEP_S = 20.0
+"""Seconds after which the state is kept within a pass."""
 
 
 def _batch_value(
@@ -34,15 +37,27 @@ def _batch_value(
     free: Array,
     base: Parameters,
     data: Data,
-    chosen: Array,
+    batch: "Batch",
+    counts: dict[str, Array],
 ) -> Array:
-    """The objective of some runs of a group."""
-    some = jax.tree.map(lambda leaf: leaf[chosen], data)
-    counts = count(some, tuple(weights_of(objective)))
+    """The share that some runs of a group have in the objective of all runs."""
+    some = jax.tree.map(lambda leaf: leaf[batch.chosen], data)
+    fresh = batch.fresh[:, None, None]
+    told = {name: truth._replace(judged=truth.judged & fresh) for name, truth in some.truth.items()}
+    some = some._replace(truth=told, counted=some.counted & fresh)
     return evaluate_at(model, objective, where, free, base, some, counts)
 
 
 _gradient = partial(jit, static_argnums=(0, 1, 2))(jax.grad(_batch_value, 3))
+
+
+class Batch(NamedTuple):
+    """Runs of a step."""
+
+    chosen: Any
+    """(size,) their place in the group."""
+    fresh: Any
+    """(size,) False where a run only fills the batch."""
 
 
 @dataclass
@@ -62,7 +77,7 @@ class Batches(Descent):
         super().__post_init__()
         self.adam = optax.scale_by_adam()
         self._begin(self.start, RATE)
-        self.halved = 0
+        self.halved = self.done = 0
 
     def begin_at(self, free: Any) -> None:
         """Begin elsewhere than at the start, about which the prior stays."""
@@ -82,44 +97,61 @@ class Batches(Descent):
         self.halved = len(self.history)
 
     def _step(self, patience: int, progress: Progress | None) -> str:
-        while len(self.history) < self.iterations:
-            value = float("nan") if self.skipped else self.value(self.free)
-            self.filterings += not self.skipped
-            finite = bool(np.isfinite(value))
-            held = self.validation_value(self.free) if finite else float("nan")
-            step = Iteration(len(self.history), value, held, not finite)
-            self.record(step, self.free, progress)
-            if step.number - self.since >= patience:
-                return f"no improvement in {patience} iterations"
-            assert self.best is not None
-            if not finite:
-                self._begin(self.best.free, 0.25 * self.rate)
-            elif step.number - max(self.since, self.halved) >= _STALE:
-                self.halved = step.number
-                self._begin(self.best.free, 0.5 * self.rate)
-            if self.rate < _LEAST_RATE * RATE:
-                return "converged"
-            self._pass(step.number)
+        while len(self.history) < self.iterations or self.done:
+            # With steps done it goes on in the middle of a pass, whose beginning is judged already.
+            if not self.done and (reason := self._judge_pass(patience, progress)):
+                return reason
+            self._pass(len(self.history) - 1)
             if self.keep is not None:
                 self.keep(self.state_dict())
         return self.all_done if self.best is not None else super()._step(patience, progress)
 
+    def _judge_pass(self, patience: int, progress: Progress | None) -> str:
+        """Judge where the last pass led and choose the rate of the next; a reason to stop, or nothing."""
+        value = float("nan") if self.skipped else self.value(self.free)
+        self.filterings += not self.skipped
+        finite = bool(np.isfinite(value))
+        held = self.validation_value(self.free) if finite else float("nan")
+        step = Iteration(len(self.history), value, held, not finite)
+        self.record(step, self.free, progress)
+        if step.number - self.since >= patience:
+            return f"no improvement in {patience} iterations"
+        assert self.best is not None
+        if not finite:
+            self._begin(self.best.free, 0.25 * self.rate)
+        elif step.number - max(self.since, self.halved) >= _STALE:
+            self.halved = step.number
+            self._begin(self.best.free, 0.5 * self.rate)
+        return "converged" if self.rate < _LEAST_RATE * RATE else ""
+
     def _pass(self, number: int) -> None:
         """A step for each batch, in an order that only the seed and the pass's number decide."""
         rng = np.random.default_rng([self.seed, number])
-        batches = [(data, chosen) for data in self.training for chosen in cut(data, self.size, rng)]
-        for i in rng.permutation(len(batches)):
-            data, chosen = batches[i]
-            given = self.model, self.objective, self.layout, on_host(self.free), self.base
-            slope = np.asarray(_gradient(*given, data, chosen))
-            slope = np.where(self.fixed, 0.0, slope + self._prior(on_host(self.free))[1])
+        batches = [(data, batch) for data in self.training for batch in cut(data, self.size, rng)]
+        order, kept = rng.permutation(len(batches)), time.monotonic()
+        for i in order[self.done :]:
+            data, batch = batches[i]
+            slope = self.slope(data, batch, len(batches))
             if not np.isfinite(slope).all():
-                self.skipped += 1
+                self.skipped, self.done = 1, 0
                 return
             change, self.memory = self.adam.update(jnp.asarray(slope), self.memory)
             self.free = self.free - self.rate * jnp.asarray(change)
+            self.done += 1
+            if self.keep is not None and time.monotonic() - kept > KEEP_S:
+                self.keep(self.state_dict())
+                kept = time.monotonic()
+        self.done = 0
         # What fills the last batch is filtered too, but is less than a batch of each group.
         self.evaluations += 1
+
+    def slope(self, data: Data, batch: Batch, number: int) -> Floats:
+        """The gradient by one batch of so many, prior included: their mean is that of all runs."""
+        plain = on_host(self.free)
+        given = self.model, self.objective, self.layout, plain, self.base
+        counts = {name: total / number for name, total in self.training_counts.items()}
+        slope = np.asarray(_gradient(*given, data, batch, counts))
+        return np.where(self.fixed, 0.0, slope + self._prior(plain)[1])
 
     def state_dict(self) -> dict[str, Any]:
         """All that the loop goes on from, as arrays by name."""
@@ -132,16 +164,19 @@ class Batches(Descent):
         """Go on from where `state_dict` was taken."""
         super().restore(kept)
         self._begin(kept["batches_free"], float(kept["batches_rate"]))
-        self.skipped, self.halved = int(kept["batches_skipped"]), int(kept["batches_halved"])
+        for name in ("skipped", "halved", "done"):
+            setattr(self, name, int(kept[f"batches_{name}"]))
         leaves, structure = jax.tree.flatten(self.memory)
         again = [jnp.asarray(kept[f"adam_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
         self.memory = jax.tree.unflatten(structure, again)
 
 
-def cut(data: Data, size: int, rng: np.random.Generator) -> list[Any]:
+def cut(data: Data, size: int, rng: np.random.Generator) -> list[Batch]:
     """The runs of a group in random order, as many at a time; the last batch is filled with the first."""
     runs = len(data.place)
     size = min(size, runs)
     order = rng.permutation(runs)
     number = -(-runs // size)
-    return list(np.resize(order, number * size).reshape(number, size))
+    chosen = np.resize(order, number * size).reshape(number, size)
+    fresh = np.arange(number * size).reshape(number, size) < runs
+    return [Batch(*each) for each in zip(chosen, fresh, strict=True)]

@@ -385,6 +385,8 @@ def test_another_tunings_state_is_refused(tmp_path, runs):
     [
         (tuning.Free("noise.optical", prior=0.0), "a prior of 0.0"),
         (tuning.Free("noise.optical", bounds=(1.0, 2.0)), "bounds 1.0 and 2.0"),
+        (tuning.Free("noise.optical", bounds=(0.0, 2.0)), "of deviations positive"),
+        (tuning.Free("calibration.clock_offset", bounds=(-1.0, np.inf)), "finite numbers"),
         (tuning.Free("truth.origin"), "truth.origin"),
     ],
 )

@@ -89,6 +89,42 @@ def test_the_worse_half_is_dropped():
     assert found.winner is one[1]
 
 
+def test_the_winner_stays_the_winner():
+    """Would catch a tuning that was stopped and goes on with a start that had lost: the winner, judged anew
+    with numbers held at their start, looks worse than one that is out."""
+
+    def search(value):
+        step = Iteration(7, value, float("nan"), False)
+        return SimpleNamespace(
+            best=Best(None, step),
+            judged=lambda s: s.training,
+            stopped="converged",
+            state_dict=dict,
+            restore=lambda kept: None,
+        )
+
+    one: Any = [search(2.0), search(1.0)]
+    found = starting.Race(one)
+    assert found.run(15, None) is one[1]
+    one[1].best = Best(None, Iteration(9, 3.0, float("nan"), False))
+    again = starting.Race(one)
+    again.restore(found.state_dict())
+    assert again.run(15, None) is one[1]
+
+
+def test_a_drawn_start_that_cannot_be_warmed_is_kept():
+    """Would catch one impossible start that ends the tuning of all; the given start's fault is told."""
+
+    def fails(steps):
+        raise TuningError("got nothing finite")
+
+    good: Any = SimpleNamespace(history=[], warm=lambda steps: None)
+    bad: Any = SimpleNamespace(history=[], warm=fails)
+    starting.Race([good, bad]).warm(3)
+    with pytest.raises(TuningError):
+        starting.Race([bad, good]).warm(3)
+
+
 def test_starts_are_drawn_within_their_reach(runs):
     """Would catch starts so far off that none of them helps, or all at one place."""
     free = [

@@ -17,7 +17,8 @@ from tuning import noise
 pytestmark = pytest.mark.long
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
-SEEDS = 100 if LONG else 5
+# Of 100 seeds a ratio is known to 7 %, so that the largest of twelve may pass 1.2 by chance; of 200 to 5 %.
+SEEDS = 200 if LONG else 5
 MODEL = jaxekf.get_model("loose")
 MATRIX = np.array([[1.01, 0.004, -0.006], [-0.003, 0.99, 0.005], [0.002, -0.004, 1.005]])
 OFFSET_S = 0.005
@@ -79,7 +80,7 @@ def test_errors_are_as_large_as_the_bound(found):
     sigma = np.array([one.information.sigma(one.fixed) for one in found])
     assert not any(one.fixed.any() for one in found)
     ratio = np.sqrt(np.mean((error / sigma) ** 2, axis=0))
-    # With so many seeds a ratio of 1 is measured as up to this much; with 100 the bound is asked for.
+    # With so many seeds a ratio of 1 is measured as up to this much; with 200 the bound is asked for.
     limit = 1.2 if LONG else float(np.sqrt(chi2.ppf(0.9999, SEEDS) / SEEDS))
     assert ratio.max() <= limit, dict(zip(found[0].layout.labels(), ratio.round(2), strict=True))
     inside = np.abs(error) <= 1.96 * sigma

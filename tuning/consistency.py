@@ -14,10 +14,10 @@ from tuning.noise import Layout
 from tuning.objectives import Objective, error_and_covariance, run_batch
 
 
-@partial(jit, static_argnums=0)
-def _nees(model: Model, every: Parameters, data: Data) -> tuple[Array, Array]:
+@partial(jit, static_argnums=(0, 1))
+def _nees(model: Model, smooth: bool, every: Parameters, data: Data) -> tuple[Array, Array]:
     """Sum of normalised squared attitude errors over all judged instants, and of degrees of freedom."""
-    output = run_batch(model, every, data, "estimates")
+    output = run_batch(model, every, data, "estimates", smooth=smooth)
     error, cov = error_and_covariance(model, every, output, data)
     judged = data.truth["attitude"].judged
     solved = jnp.linalg.solve(cov, error[..., None])[..., 0]
@@ -30,18 +30,25 @@ def is_open(objective: Objective, groups: Sequence[Data]) -> bool:
     return not objective.likelihood and not objective.truth and "attitude" in groups[0].truth
 
 
-def scale(model: Model, params: Parameters, groups: Sequence[Data], where: Layout) -> float:
+def scale(
+    model: Model,
+    params: Parameters,
+    groups: Sequence[Data],
+    where: Layout,
+    *,
+    smooth: bool = False,
+) -> float:
     """The factor for Q, R and P0 at which the attitude errors match their covariances on average.
 
     Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set). `where` says
-    what each run has of its own.
+    what each run has of its own; with `smooth` the errors are those of the smoothed estimate.
     """
     if not any("attitude" in d.truth and bool(jnp.any(d.truth["attitude"].judged)) for d in groups):
         raise TuningError(
             "got no scored encoder sample, expected some to compare covariances with; tune by"
             " likelihood without rescaling"
         )
-    found = [_nees(model, where.of_runs(params, d.setup, d.place), d) for d in groups]
+    found = [_nees(model, smooth, where.of_runs(params, d.setup, d.place), d) for d in groups]
     factor = float(sum(squared for squared, _ in found) / sum(freedom for _, freedom in found))
     if not 0.0 < factor < float("inf"):
         raise TuningError(

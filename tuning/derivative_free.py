@@ -235,7 +235,9 @@ class Problem:
         if not self.rescale:
             return 1.0
         params = self.layout.from_free(jnp.asarray(found.best), self.base)
-        return consistency.scale(self.model, params, self.search.training, self.layout)
+        smooth = self.search.objective.smoothed
+        given = self.model, params, self.search.training, self.layout
+        return consistency.scale(*given, smooth=smooth)
 
     def searched(self, found: Found, scale: float) -> Searched:
         """What was found as parameters."""

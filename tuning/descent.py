@@ -292,6 +292,8 @@ class Descent:
         other = Descent(*given, fisher=True, width=self.width)
         other.begin_at(self.walk.candidate)
         other.run(steps, None)
+        if "interrupted" in other.stopped:
+            raise KeyboardInterrupt
         assert other.best is not None
         self.begin_at(other.best.free)
         self.evaluations += other.evaluations

@@ -257,9 +257,11 @@ def _told(
     assert search.best is not None
     where, best = search.layout, search.best.step
     params, scale = where.from_free(search.best.free, search.base), 1.0
+    together = where.together(params)
     if rescale:
-        scale = consistency.scale(search.model, params, search.training, where)
-        params = scaled(params, scale)
+        smooth = search.objective.smoothed
+        scale = consistency.scale(search.model, params, search.training, where, smooth=smooth)
+        params, together = scaled(params, scale), scaled(together, scale)
     each = {name: where.one_run(params, i) for i, name in enumerate(runs)} if where.own else {}
     origin = {
         "runs": runs,
@@ -281,7 +283,7 @@ def _told(
         origin["validation_value"] = best.validation
     return Tuned(
         model=search.model,
-        params=where.together(params)._replace(truth=()),
+        params=together._replace(truth=()),
         start=search.base,
         objective=search.objective,
         best=best,
@@ -330,7 +332,9 @@ def fit_runs(
     """
     recordings = read(runs)
     names = _names(recordings)
-    where = tuned.layout.only(tuned.layout.own).for_runs_number(len(recordings))
+    # What an encoder has of its own no innovation tells.
+    own = {name for name in tuned.layout.own if not name.startswith("truth.")}
+    where = tuned.layout.only(own).for_runs_number(len(recordings))
     if not where.leaves:
         return dict.fromkeys(names, tuned.params)
     groups: tuple[Data, ...] = prepare_groups(

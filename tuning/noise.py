@@ -131,7 +131,9 @@ def _unbend(bent: Array, bounds: tuple[float, float] | None) -> Array:
     if bounds is None:
         return bent
     middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    return middle + half * jnp.arctanh((bent - middle) / half)
+    # Covariances that are scaled to the errors may leave the bounds: then as near to them as can be.
+    inside = jnp.clip((bent - middle) / half, -1.0 + 1e-9, 1.0 - 1e-9)
+    return middle + half * jnp.arctanh(inside)
 
 
 @dataclass(frozen=True)
@@ -333,8 +335,13 @@ def _bounds(name: str, value: Any, kind: str, step: float, asked: Any) -> Any:
             f"got bounds {low} and {high} for {name} with {got}, expected numbers that hold the start"
             " between them; widen them, or leave them out"
         )
+    if not np.isfinite(high - low) or (kind == "log" and low <= 0.0):
+        raise TuningError(
+            f"got bounds {low} and {high} for {name}, expected finite numbers, of deviations positive ones;"
+            " give a small or a large number instead"
+        )
     if kind == "log":
-        return float(np.log(max(low, 1e-300))), float(np.log(high))
+        return float(np.log(low)), float(np.log(high))
     return low / step, high / step
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf.blocks import LANES
+from jaxekf.errors import TuningError
 from jaxekf.recording import Floats
 from tuning.data import Data
 from tuning.descent import Descent, Progress
@@ -62,6 +63,8 @@ class Race:
     dropped: dict[int, str] = field(default_factory=dict)
     """Searches that are out, and why."""
     round: int = 0
+    won: int = -1
+    """The search that is gone on with, once it is over: judged anew, it may look worse than others."""
 
     def __post_init__(self) -> None:
         self.tries = [0] * len(self.searches)
@@ -77,9 +80,15 @@ class Race:
 
     def warm(self, steps: int) -> None:
         """As `Descent.warm`, for each that has not begun."""
-        for search in self.searches:
-            if not search.history:
+        for i, search in enumerate(self.searches):
+            if search.history:
+                continue
+            try:
                 search.warm(steps)
+            except TuningError:
+                # Nothing is finite there: a drawn start begins as drawn, and `_advance` brings it nearer.
+                if i == 0:
+                    raise
 
     @property
     def _leader(self) -> int:
@@ -111,6 +120,8 @@ class Race:
 
     def run(self, patience: int, progress: Progress | None) -> Descent:
         """Step all until one is left or all have stopped; the one with the best step."""
+        if self.won >= 0:
+            return self.searches[self.won]
         try:
             while self.running and self.running != [self._leader]:
                 self._round(patience)
@@ -125,6 +136,7 @@ class Race:
             self.winner.interrupt()
             for i in self.running:
                 self.dropped[i] = self.winner.stopped
+        self.won = self._leader
         return self.winner
 
     def _round(self, patience: int) -> None:
@@ -180,6 +192,7 @@ class Race:
     def state_dict(self) -> dict[str, Any]:
         """All that the race, and the search that goes on after it, go on from."""
         found: dict[str, Any] = {"round": np.array(self.round), "tries": np.array(self.tries)}
+        found["won"] = np.array(self.won)
         found["out"] = np.array(list(self.dropped), int)
         found["why_out"] = np.array(list(self.dropped.values()), str)
         for i, search in enumerate(self.searches):
@@ -190,6 +203,7 @@ class Race:
     def restore(self, kept: dict[str, Any]) -> None:
         """Go on from where `state_dict` was taken."""
         self.round, self.tries = int(kept["round"]), [int(n) for n in kept["tries"]]
+        self.won = int(kept["won"])
         self.dropped = {
             int(i): str(why) for i, why in zip(kept["out"], kept["why_out"], strict=True)
         }

@@ -33,6 +33,7 @@ from jaxekf.files import check_output
 from jaxekf.model import Parameters
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
+from tuning.frame import TRUTH_UNITS
 from tuning.noise import AXES
 from tuning.objectives import parse
 from tuning.spec import read_free
@@ -231,7 +232,8 @@ def tune(
         tuning.forget_folds(state)
     _note(tuned, output)
     scored = [run for run in judging or training if run.encoder is not None]
-    rows = _compare(tuned, scored, start, bool(judging), smooth) if scored else []
+    theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if judging else {}
+    rows = _compare(tuned, scored, start, theirs, smooth) if scored else []
     tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
@@ -259,11 +261,10 @@ def _compare(
     tuned: tuning.Tuned,
     runs: list[Recording],
     start: Parameters,
-    held_out: bool,
+    found: dict[str, Parameters],
     smooth: bool,
 ) -> list[tuning.Row]:
-    """Start and tuned parameters beside each other; a held-out run's own are found without its truth."""
-    found = tuning.fit_runs(runs, tuned) if held_out else {}
+    """Start and tuned parameters beside each other; `found` are those of held-out runs, by name."""
     own = [found.get(run.name, tuned.of_run(run)) for run in runs]
     variants = {"start": start, "tuned": own}
     return tuning.compare(tuned.model, runs, variants, smooth=smooth).rows
@@ -315,7 +316,7 @@ def _print_known(tuned: tuning.Tuned) -> None:
 def _print_noise(tuned: tuning.Tuned) -> None:
     units = units_by_name(tuned.model)
     names = parameters.leaf_names(tuned.params)
-    before = jax.tree.leaves(tuned.start)
+    before = jax.tree.leaves(tuned.start._replace(truth=()))
     after = jax.tree.leaves(tuned.params)
     rows = []
     for name, old, new in zip(names, before, after, strict=True):
@@ -323,4 +324,8 @@ def _print_noise(tuned: tuning.Tuned) -> None:
             continue
         turn, shown = in_degrees(units[name])
         rows.append([name, short(turn(old)), short(turn(new)), shown])
+    if tuned.truth is not None:
+        for name, found in tuned.truth._asdict().items():
+            turn, shown = in_degrees(getattr(TRUTH_UNITS, name))
+            rows.append([f"truth.{name}", short(turn(0.0 * found)), short(turn(found)), shown])
     print_table("Tuned parameters", ["parameter", "start", "tuned", "unit"], rows)

@@ -195,8 +195,7 @@ class Problem:
     @property
     def relative(self) -> Flags:
         """(n,) numbers that are logarithms."""
-        leaves = self.layout.leaves
-        return np.array([leaf.is_logarithm(i) for leaf in leaves for i in range(leaf.size)])
+        return self.layout.is_logarithm
 
     @property
     def steps(self) -> Floats:

@@ -166,11 +166,9 @@ class Descent:
 
     def _scoring(self, free: Array, gradient: Array) -> Array:
         """The step of Fisher scoring: down the gradient by the inverse of the expected curvature."""
-        known = self._known
-        if known is None or not np.array_equal(known.free, on_host(free)):
-            known = information(self.model, self.layout, free, self.base, self.training)
-            self.filterings += self.information_cost
-        curved = self.objective.likelihood * known.matrix
+        # A direction is asked for only where value and score were taken just before.
+        assert self._known is not None and np.array_equal(self._known.free, on_host(free))
+        curved = self.objective.likelihood * self._known.matrix
         curved = curved + self.objective.prior * np.diag(self.layout.prior**-2.0)
         # Where nothing is known, and no prior counts, a step is short rather than endless.
         curved = curved + np.diag(1e-3 * self.layout.prior**-2.0)

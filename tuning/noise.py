@@ -167,6 +167,11 @@ class Layout:
         )
 
     @property
+    def is_logarithm(self) -> Any:
+        """(n,) numbers that are logarithms."""
+        return np.array([leaf.is_logarithm(i) for leaf in self.leaves for i in range(leaf.size)])
+
+    @property
     def own_of_one_run(self) -> Any:
         """Which of the numbers that one run is filtered with are its own, as indices."""
         own = np.concatenate([np.full(leaf.each, leaf.runs > 0) for leaf in self.leaves])

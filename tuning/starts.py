@@ -37,9 +37,8 @@ class Outcome(NamedTuple):
 def draw(where: Layout, start: Floats, count: int, seed: int) -> list[Floats]:
     """Free vectors to start from: the given one, and others about it, uniform within 1.5 deviations of the
     prior for logarithms (at most 1.5 decades), half a deviation for calibration; the truth's stay."""
-    is_logarithm = [leaf.is_logarithm(i) for leaf in where.leaves for i in range(leaf.size)]
     wide = np.minimum(_SPREAD * where.prior, _DECADES)
-    reach = np.where(is_logarithm, wide, _NEAR * where.prior)
+    reach = np.where(where.is_logarithm, wide, _NEAR * where.prior)
     reach = np.where(where.is_truth, 0.0, reach)
     rng = np.random.default_rng(seed)
     others = start + reach * rng.uniform(-1.0, 1.0, (count - 1, len(start)))
@@ -215,13 +214,12 @@ class Race:
 
 
 def line_up(make: Callable[..., Descent], count: int, seed: int) -> Race:
-    """Searches of one problem, which `make` gives for a `width`, from the given start and drawn ones."""
-    first = make(width=1)
+    """Searches of one problem, which `make` gives, from the given start and drawn ones."""
+    searches = [make() for _ in range(count)]
+    first = searches[0]
     width = 1 if first.fisher else points_at_once(first.training, count)
-    searches = [make(width=width) for _ in range(count)] if width > 1 else [first]
-    searches += [make() for _ in range(count - len(searches))]
-    for search, point in zip(
-        searches[1:], draw(first.layout, first.start, count, seed)[1:], strict=True
-    ):
+    points = draw(first.layout, first.start, count, seed)
+    for search, point in zip(searches, points, strict=True):
+        search.width = width
         search.begin_at(point)
     return Race(searches)

@@ -1,7 +1,7 @@
 """Noise, calibration and initial belief as TOML files with units and where they came from."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,20 @@ def save_calibration(
 ) -> None:
     """Write `calibration.toml` alone; see `save`."""
     _write(Path(path) / "calibration.toml", model, params, origin, ("calibration",))
+
+
+def forget(folder: Path, keep: Collection[str]) -> None:
+    """Remove the parameter files of an earlier result from the folders in `folder`, except those of some
+    names; anything else there stays."""
+    for old in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if old.name in keep or not old.is_dir():
+            continue
+        for name in ("noise.toml", "calibration.toml"):
+            (old / name).unlink(missing_ok=True)
+        if not any(old.iterdir()):
+            old.rmdir()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _write(

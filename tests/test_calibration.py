@@ -25,7 +25,7 @@ from jaxekf.cli import main
 from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import from_scipy, to_scipy
-from tuning import noise, objectives
+from tuning import consistency, noise, objectives
 from tuning.data import prepare_groups
 from tuning.descent import Descent
 from tuning.frame import no_correction
@@ -170,6 +170,59 @@ def test_a_run_is_filtered_with_its_own_numbers(values):
         alone = flat.from_free(free[index], base)
         for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(every), strict=True):
             np.testing.assert_allclose(one, other[k], rtol=1e-12)
+
+
+@pytest.mark.parametrize("at", [0.0101, 0.5, 0.999])
+def test_bounds_change_nothing_at_the_start(at):
+    """Would catch a start near one of its bounds at which steps, prior and interval are those of a number
+    that the bounds have bent."""
+    start = as_arrays(MODEL.parameters)
+    start = start._replace(noise=start.noise._replace(optical=jnp.asarray(at)))
+    bound = noise.layout(MODEL, start, [tuning.Free("noise.optical", bounds=(0.01, 1.0))])
+    free = noise.layout(MODEL, start, ["noise.optical"])
+    here = free.to_free(start)
+    np.testing.assert_allclose(bound.to_free(start), here, rtol=0.0, atol=1e-12)
+    slope = jax.jacfwd(lambda x: jnp.log(bound.from_free(x, start).noise.optical))(here)
+    np.testing.assert_allclose(slope, 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("free", "objective", "scaled"),
+    [
+        (["noise.optical"], tuning.attitude_error(), True),
+        (["initial"], tuning.attitude_error(), True),
+        (["calibration.clock_offset"], tuning.attitude_error(), False),
+        (["noise"], tuning.innovation_likelihood(), False),
+    ],
+)
+def test_only_free_noise_is_scaled(free, objective, scaled, runs):
+    """Would catch noise that a tuning of calibration alone changes by the common scale."""
+    where = noise.layout(MODEL, as_arrays(MODEL.parameters), free)
+    groups = prepare_groups(MODEL, runs[:1], burn_in_s=0.0, need_truth=True)
+    assert consistency.is_open(objective, groups, where) is scaled
+
+
+def test_what_an_earlier_tuning_left_is_gone(tuned, tmp_path):
+    """Would catch a run's own parameters of another tuning read beside these."""
+    for name in ("run-0", "gone", "mine"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "noise.toml").write_text("")
+    (tmp_path / "runs" / "mine" / "notes.txt").write_text("a user's own")
+    tuned.save(tmp_path)
+    left = sorted(str(f.relative_to(tmp_path / "runs")) for f in tmp_path.glob("runs/*/*"))
+    both = ["calibration.toml", "noise.toml"]
+    assert left == ["mine/notes.txt", *(f"run-{i}/{name}" for i in range(2) for name in both)]
+    replace(tuned, each={}).save(tmp_path)
+    assert [f.name for f in (tmp_path / "runs").iterdir()] == ["mine"]
+
+
+def test_results_of_one_name_are_refused(runs, tuned):
+    """Would catch two runs of one name of which only one keeps its own parameters."""
+    twice = [runs[0], runs[1].replace(name=runs[0].name)]
+    with pytest.raises(TuningError, match="several runs of the name"):
+        tuning.fit_runs(twice, tuned)
+    with pytest.raises(TuningError, match="several runs of the name"):
+        tuning.tune(twice, free=[tuning.Free("noise", each_run=True)])
 
 
 @pytest.fixture(scope="module")

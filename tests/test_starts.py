@@ -11,7 +11,7 @@ import tuning
 from jaxekf import simulate
 from jaxekf.errors import TuningError
 from jaxekf.parameters import as_arrays
-from tuning import batches
+from tuning import batches, resume
 from tuning import starts as starting
 from tuning.batches import Batches, cut
 from tuning.data import prepare_groups
@@ -115,10 +115,10 @@ def test_the_winner_stays_the_winner():
 def test_a_drawn_start_that_cannot_be_warmed_is_kept():
     """Would catch one impossible start that ends the tuning of all; the given start's fault is told."""
 
-    def fails(steps):
+    def fails(*_):
         raise TuningError("got nothing finite")
 
-    good: Any = SimpleNamespace(history=[], warm=lambda steps: None)
+    good: Any = SimpleNamespace(history=[], warm=lambda *_: None)
     bad: Any = SimpleNamespace(history=[], warm=fails)
     starting.Race([good, bad]).warm(3)
     with pytest.raises(TuningError):
@@ -194,6 +194,28 @@ def test_goes_on_after_a_stop(how, runs, start, race, tmp_path):
     np.testing.assert_allclose(again.free, whole.free, rtol=0.0, atol=1e-12)
     assert str(again.history) == str(whole.history)
     assert again.starts == whole.starts
+
+
+@pytest.mark.parametrize("after", [3, 9])
+def test_goes_on_after_a_stop_in_the_warm_steps(after, runs, start, tmp_path, monkeypatch):
+    """Would catch warm steps that begin anew after a stop in the middle of them, or right after them."""
+    options: dict[str, Any] = {**OPTIONS, "start": start, "warm": True, "iterations": 2}
+    steps, write = [], resume.write
+
+    def stopping(*given):
+        write(*given)
+        steps.append(1)
+        if len(steps) == after:
+            raise Stop
+
+    monkeypatch.setattr(resume, "write", stopping)
+    state = tmp_path / "state.npz"
+    with pytest.raises(Stop):
+        tuning.tune(runs, checkpoint=state, **options)
+    again = tuning.tune(runs, checkpoint=state, **options)
+    whole = tuning.tune(runs, **options)
+    np.testing.assert_allclose(again.free, whole.free, rtol=0.0, atol=1e-12)
+    assert (again.filterings, again.evaluations) == (whole.filterings, whole.evaluations)
 
 
 def test_batches_come_to_the_same_place(runs, start, alone):

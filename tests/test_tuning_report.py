@@ -317,10 +317,21 @@ def worse_fold(document):
         (change(0, change=0.09, run="a"), ["noise.optical of a moved by more than a factor"]),
         (change(1, change=2.9), []),
         (change(1, change=-3.1), ["clock_offset moved by more than 3 deviations of its prior"]),
-        (change(0, bounds=[0.001, 0.03]), []),
-        (change(0, bounds=[0.001, 0.0201]), ["noise.optical is at its upper bound (0.0201 rad)"]),
+        (change(0, bounds=[0.001, 0.05]), []),
+        (
+            change(0, bounds=[0.001, 0.0201], written=0.02),
+            ["noise.optical is at its upper bound (0.0201 rad)"],
+        ),
         (change(1, bounds=[0.0009, 0.1]), ["clock_offset is at its lower bound (0.0009 s)"]),
         (change(1, bounds=[-0.001, 0.1]), []),
+        (
+            change(0, bounds=[0.001, 0.03], written=0.04),
+            ["scale of all covariances (4) took noise.optical past the bounds"],
+        ),
+        (
+            lambda d: d.update(also_scaled=["noise.gyroscope"]),
+            ["(4) also holds for noise.gyroscope, not free"],
+        ),
         (lambda d: d.update(rejected_steps=1), ["1 step was not finite"]),
         (lambda d: d.update(stopped="the 9 iterations asked for are done"), ["ask for more"]),
         (lambda d: d.update(stopped="no improvement in 15 iterations"), []),

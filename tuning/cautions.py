@@ -27,6 +27,7 @@ def cautions(record: Mapping[str, Any]) -> list[str]:
         _left_open,
         _far,
         _bounded,
+        _scaled,
         _worse,
         _honest,
     )
@@ -101,6 +102,27 @@ def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
                     f"{called(number)} is at its {which} bound ({bound:.5g} {number['unit']}): the data"
                     " ask for more; widen the bounds, or look for what makes it go there"
                 )
+
+
+def _scaled(record: Mapping[str, Any]) -> Iterable[str]:
+    factor = record["covariance_scale"]
+    past = []
+    for number in record["numbers"]:
+        bounds, value = number["bounds"], number["written"]
+        if bounds is None or value is None:
+            continue
+        if not bounds[0] <= value <= bounds[1] and bounds[0] <= number["tuned"] <= bounds[1]:
+            past.append(called(number))
+    if past:
+        yield (
+            f"The common scale of all covariances ({factor:.4g}) took {_listed(past)} past the bounds:"
+            " widen them, or tune by likelihood, which needs no such scale"
+        )
+    if also := record.get("also_scaled"):
+        yield (
+            f"The common scale of all covariances ({factor:.4g}) also holds for {_listed(also)}, not free"
+            " in this tuning: without it the estimate would change; tune by likelihood to keep them"
+        )
 
 
 def _worse(record: Mapping[str, Any]) -> Iterable[str]:

@@ -10,7 +10,7 @@ from jaxekf.errors import TuningError
 from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from tuning.data import Data
-from tuning.noise import Layout
+from tuning.noise import SCALED, Layout
 from tuning.objectives import Objective, error_and_covariance, run_batch
 
 
@@ -25,9 +25,12 @@ def _nees(model: Model, smooth: bool, every: Parameters, data: Data) -> tuple[Ar
     return jnp.sum(squared), error.shape[-1] * jnp.sum(judged)
 
 
-def is_open(objective: Objective, groups: Sequence[Data]) -> bool:
-    """Whether an objective, one of errors alone, leaves the common scale open that attitude errors fix."""
-    return not objective.likelihood and not objective.truth and "attitude" in groups[0].truth
+def is_open(objective: Objective, groups: Sequence[Data], where: Layout) -> bool:
+    """Whether a fit leaves the common scale open that attitude errors fix: where noise or initial belief
+    is free and the objective is one of errors alone."""
+    free = any(leaf.name.startswith(SCALED) for leaf in where.leaves)
+    alone = not objective.likelihood and not objective.truth
+    return free and alone and "attitude" in groups[0].truth
 
 
 def scale(

@@ -190,7 +190,7 @@ class Problem:
         self.search = Descent(self.model, aim, self.layout, self.base, groups, None, iterations=0)
         self.start, self.value = self.search.start, self.search.value
         rescale = asked.get("rescale")
-        self.rescale = consistency.is_open(aim, groups) if rescale is None else rescale
+        self.rescale = consistency.is_open(aim, groups, self.layout) if rescale is None else rescale
 
     @property
     def relative(self) -> Flags:

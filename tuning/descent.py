@@ -111,7 +111,6 @@ class Descent:
     """(n,) numbers that stay at their start."""
     best: Best | None = None
     history: list[Iteration] = field(default_factory=list)
-    rounds: int = 0
     evaluations: int = 0
     """Of the objective with its gradient; Fisher scoring takes none."""
     stopped: str = ""
@@ -280,15 +279,24 @@ class Descent:
             raise KeyboardInterrupt
         self.stopped = "interrupted; the best so far is kept"
 
-    def warm(self, steps: int) -> None:
+    def warm(
+        self,
+        steps: int,
+        keep: Callable[[dict[str, Any]], None] | None = None,
+        kept: dict[str, Any] | None = None,
+    ) -> None:
         """Begin not at the start but where some steps of Fisher scoring on the likelihood lead from there.
 
         Errors are flat, or rise, far from their minimum where the likelihood still falls towards its own.
+        `keep` is called after each step with what these steps go on from, when it is given as `kept`.
         """
         aim = Objective(likelihood=1.0, prior=1.0)
         given = (self.model, aim, self.layout, self.base, self.training, None, steps)
         other = Descent(*given, fisher=True, width=self.width)
         other.begin_at(self.walk.candidate)
+        other.keep = keep
+        if kept:
+            other.restore(kept)
         other.run(steps, None)
         if "interrupted" in other.stopped:
             raise KeyboardInterrupt
@@ -308,7 +316,7 @@ class Descent:
         free = np.where(fixed, self.start, on_host(self.best.free))
         self.walk = self._walk(free)
         self.fallback = self.best._replace(free=free)
-        self.best, self.rounds, self.since = None, self.rounds + 1, len(self.history)
+        self.best, self.since = None, len(self.history)
         self.stopped = ""
         # Enough to come back from the start of a few numbers.
         self.iterations = max(self.iterations, len(self.history) + 10)
@@ -379,7 +387,6 @@ class Descent:
             "best_free": np.asarray(self.best.free),
             "best_number": np.array(self.best.step.number),
             "since": np.array(self.since),
-            "rounds": np.array(self.rounds),
             "iterations": np.array(self.iterations),
             "evaluations": np.array(self.evaluations),
             "filterings": np.array(self.filterings),
@@ -390,17 +397,29 @@ class Descent:
             found["own_free"] = np.asarray(self.own_free)
         return found
 
+    def beginning(self) -> dict[str, Any]:
+        """Where a search that has not begun is to begin, and the work that it took to come there."""
+        return {
+            "begin": on_host(self.walk.candidate),
+            "evaluations": np.array(self.evaluations),
+            "filterings": np.array(self.filterings),
+        }
+
     def restore(self, kept: dict[str, Any]) -> None:
-        """Go on from where `state_dict` was taken."""
+        """Go on from where `state_dict` or `beginning` was taken."""
+        self.evaluations = int(kept["evaluations"])
+        self.filterings = float(kept["filterings"])
+        if "begin" in kept:
+            self.begin_at(kept["begin"])
+            return
         self.fixed = np.asarray(kept["fixed"], bool)
         self.walk.restore({k.removeprefix("walk_"): v for k, v in kept.items()})
         self.history = [
             Iteration(int(n), float(t), float(v), bool(r)) for n, t, v, r in kept["history"]
         ]
         self.best = Best(kept["best_free"], self.history[int(kept["best_number"])])
-        self.since, self.rounds = int(kept["since"]), int(kept["rounds"])
-        self.evaluations, self.iterations = int(kept["evaluations"]), int(kept["iterations"])
-        self.filterings = float(kept["filterings"])
+        self.since = int(kept["since"])
+        self.iterations = int(kept["iterations"])
         self.own_free = kept.get("own_free")
         self.stopped = str(kept["stopped"])
 

@@ -31,8 +31,6 @@ from tuning.starts import Outcome, Race, line_up
 from tuning.validation import Row
 from tuning.ways import searcher
 
-_ROUNDS = 2
-"""Times that the search goes on after something was found to be open and was fixed at its start."""
 _OWN_FIT = 8
 _WARM_STEPS = 12
 
@@ -103,7 +101,7 @@ class Tuned:
         for leaf in self.layout.leaves:
             for i in range(leaf.size):
                 end, begin = self.free[at + i], start[at + i]
-                change = leaf.straight(end) - leaf.straight(begin)
+                change = leaf.straight(end, i) - leaf.straight(begin, i)
                 if leaf.is_logarithm(i):
                     told.append(f"x {np.exp(change):.3g}")
                 else:
@@ -113,7 +111,7 @@ class Tuned:
 
     def of_run(self, run: Run) -> Parameters:
         """The parameters of a training run, its own included."""
-        return self.each.get(_name(run), self.params)
+        return self.each.get(read([run])[0].name, self.params)
 
     def save(
         self,
@@ -129,8 +127,10 @@ class Tuned:
         """
         told = record(self, rows=rows, judged_on=judged_on, folds=folds)
         parameters.save(folder, self.model, self.params, self.origin)
+        of_runs = Path(folder) / "runs"
         for name, params in self.each.items():
-            parameters.save(Path(folder) / "runs" / name, self.model, params, self.origin)
+            parameters.save(of_runs / name, self.model, params, self.origin)
+        parameters.forget(of_runs, keep=self.each)
         write_record(folder, told)
 
 
@@ -187,9 +187,9 @@ def tune(
     With a `checkpoint` (a file) a tuning that was stopped, however, goes on from its last iteration when it
     is called again with the same arguments; the file is gone when it has ended, and stays after Ctrl-C.
 
-    The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when no
-    likelihood is in the objective) they are scaled afterwards so that the training errors match
-    their covariances.
+    The error alone does not fix the common scale of Q, R and P0; with `rescale` (the default when noise is
+    free and no likelihood is in the objective) they are scaled afterwards so that the training errors match
+    their covariances: all of them, since only so does the estimate stay.
 
     Raises `TuningError` where the problem is ill-posed, and what `estimate` raises for bad data.
     """
@@ -200,7 +200,7 @@ def tune(
     aim = replace(aim, smoothed=smooth or aim.smoothed)
     base = starting(chosen, start, free, axes)
     where = layout(chosen, base, free, len(learnt))
-    _check(runs, validate, where, aim)
+    _check(learnt, judging, where, aim)
     options: dict[str, Any] = {"burn_in_s": burn_in_s, "need_truth": aim.needs_truth}
     training = prepare_groups(chosen, learnt, **options)
     held_out = prepare_groups(chosen, judging, **options) if validate else None
@@ -209,7 +209,7 @@ def tune(
         partial(make, chosen, aim, where, base, training, held_out, iterations), starts, seed
     )
     if checkpoint is not None:
-        asked = (_names(runs), _names(validate), iterations, patience, burn_in_s, judge, warm)
+        asked = (_names(learnt), _names(judging), iterations, patience, burn_in_s, judge, warm)
         how = (optimiser if isinstance(optimiser, str) else "own", starts, batch, seed)
         resume.attach(race, Path(checkpoint), repr((*asked, *how)))
     if warm:
@@ -217,8 +217,8 @@ def tune(
     search = race.run(patience, progress)
     known, stopped = _search(search, patience, judge, progress)
     if rescale is None:
-        rescale = consistency.is_open(aim, training)
-    tuned = _told(search, known, stopped, _names(runs), _names(validate), rescale=rescale)
+        rescale = consistency.is_open(aim, training, where)
+    tuned = _told(search, known, stopped, _names(learnt), _names(judging), rescale=rescale)
     if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
     return _of_all_starts(tuned, race, search) if starts > 1 else tuned
@@ -305,7 +305,7 @@ def _told(
 def _search(
     search: Descent, patience: int, judge: bool, progress: Progress | None
 ) -> tuple[Information | None, str]:
-    """Search, fix what the data leave open, and search on; what is known at the end."""
+    """Search, fix what the data leave open, and search on until that is all; what is known at the end."""
     while True:
         stopped = search.run(patience, progress)
         if not judge:
@@ -317,7 +317,7 @@ def _search(
         search.filterings += search.information_cost
         fixed = known.open(search.fixed)
         interrupted = "interrupted" in stopped
-        if (fixed == search.fixed).all() or search.rounds >= _ROUNDS or interrupted:
+        if (fixed == search.fixed).all() or interrupted:
             return known, stopped
         search.again(fixed)
 
@@ -331,7 +331,7 @@ def fit_runs(
     Where runs have nothing of their own these are the `params` of what was fitted, for each.
     """
     recordings = read(runs)
-    names = _names(recordings)
+    names = _names_apart(recordings)
     # What an encoder has of its own no innovation tells.
     own = {name for name in tuned.layout.own if not name.startswith("truth.")}
     where = tuned.layout.only(own).for_runs_number(len(recordings))
@@ -348,13 +348,17 @@ def fit_runs(
     return {name: where.one_run(params, i) for i, name in enumerate(names)}
 
 
-def _check(runs: Sequence[Run], validate: Sequence[Run], where: Layout, aim: Objective) -> None:
+def _check(
+    runs: Sequence[Recording], validate: Sequence[Recording], where: Layout, aim: Objective
+) -> None:
     """A run that is learnt from cannot judge what was learnt, and no innovation tells of an encoder."""
     if where.is_truth.any() and not aim.needs_truth:
         raise TuningError(
             f"got the encoder's own clock or frame free for '{aim.describe()}', expected an objective that"
             " compares with the encoder; add attitude or truth to it, or leave truth out"
         )
+    if where.own:
+        _names_apart(runs)
     both = sorted(set(_names(runs)) & set(_names(validate)))
     if both:
         raise TuningError(
@@ -363,9 +367,17 @@ def _check(runs: Sequence[Run], validate: Sequence[Run], where: Layout, aim: Obj
         )
 
 
-def _names(runs: Sequence[Run]) -> list[str]:
-    return [_name(run) for run in runs]
+def _names(runs: Sequence[Recording]) -> list[str]:
+    return [run.name for run in runs]
 
 
-def _name(run: Run) -> str:
-    return run.name if isinstance(run, Recording) else Path(run).name
+def _names_apart(runs: Sequence[Recording]) -> list[str]:
+    """Names of runs of which each has its own result: `TuningError` where two are of one name."""
+    names = _names(runs)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise TuningError(
+            f"got several runs of the name {twice}, expected each its own; change the name in"
+            " recording.toml, or leave out what is named twice"
+        )
+    return names

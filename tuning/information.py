@@ -182,7 +182,7 @@ def interval(layout: Layout, free: Any, sigma: Any) -> list[tuple[float, float, 
         for i in range(leaf.size):
             value, half = float(free[start + i]), _Z95 * float(sigma[start + i])
             ends = [value, value - half, value + half]
-            told = [leaf.straight(end) for end in ends]
+            told = [leaf.straight(end, i) for end in ends]
             if leaf.is_logarithm(i):
                 told = [float(np.exp(end)) for end in told]
             elif leaf.kind == "linear":

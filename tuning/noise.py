@@ -17,6 +17,7 @@ from jax import Array
 from jaxekf.errors import TuningError
 from jaxekf.model import Model, Parameters
 from jaxekf.parameters import as_arrays, leaf_names
+from jaxekf.recording import Floats
 from tuning.frame import TRUTH_UNITS
 
 # A step of one in the free vector changes a leaf of calibration or truth by this much, by its unit.
@@ -25,6 +26,8 @@ _NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
 _WEAK_LOG = 2.3
 _WEAK = {"s": 0.05, "1": 0.05, "rad": 0.1, "m": 0.05, "s/s": 2e-4}
 AXES = ("tied", "each", "full")
+# Nearer to a bound, as a share of the half width, a number does not come.
+_INSIDE = 1.0 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,8 @@ class Leaf:
     """Standard deviation of a free number about its start."""
     bounds: tuple[float, float] | None = None
     """Of the free number before `_bend`."""
+    middle: tuple[float, ...] = ()
+    """With bounds: where the numbers of one run start, and where `_bend` changes nothing."""
 
     @property
     def each(self) -> int:
@@ -90,12 +95,15 @@ class Leaf:
         diagonal = self.kind == "factor" and number % self.each < self.shape[0]
         return self.kind == "log" or diagonal
 
-    def straight(self, free: float) -> float:
-        """One free number before it was kept between its bounds."""
-        return float(_bend(jnp.asarray(free), self.bounds))
+    def straight(self, free: float, number: int) -> float:
+        """One of its free numbers before it was kept between its bounds."""
+        if self.bounds is None:
+            return float(free)
+        middle = np.asarray(self.middle[number % self.each])
+        return float(_bend(jnp.asarray(free), self.bounds, middle))
 
     def _free(self, value: Array) -> Array:
-        return _unbend(self._straight(value), self.bounds)
+        return _unbend(self._straight(value), self.bounds, np.asarray(self.middle))
 
     def _straight(self, value: Array) -> Array:
         if self.kind == "log":
@@ -107,7 +115,7 @@ class Leaf:
         return (value / self.step).reshape(-1)
 
     def _value(self, free: Array) -> Array:
-        free = _bend(free, self.bounds)
+        free = _bend(free, self.bounds, np.asarray(self.middle))
         if self.kind == "log":
             return jnp.exp(free).reshape(self.shape)
         if self.kind == "factor":
@@ -119,21 +127,31 @@ class Leaf:
         return free.reshape(self.shape) * self.step
 
 
-def _bend(free: Array, bounds: tuple[float, float] | None) -> Array:
-    """Any number to one between the bounds; near their middle it stays what it is."""
+def _bend(free: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
+    """Any number to one between the bounds; at the start it stays what it is, and its slope is one there,
+    so that steps, priors and intervals mean the same with bounds as without."""
     if bounds is None:
         return free
-    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    return middle + half * jnp.tanh((free - middle) / half)
+    middle, half, at, reach = _curve(bounds, start)
+    return middle + half * jnp.tanh(at + (free - start) / reach)
 
 
-def _unbend(bent: Array, bounds: tuple[float, float] | None) -> Array:
+def _unbend(bent: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
     if bounds is None:
         return bent
-    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    begin = jnp.asarray(start)
+    middle, half, at, reach = _curve(bounds, start)
     # Covariances that are scaled to the errors may leave the bounds: then as near to them as can be.
-    inside = jnp.clip((bent - middle) / half, -1.0 + 1e-9, 1.0 - 1e-9)
-    return middle + half * jnp.arctanh(inside)
+    inside = jnp.clip((bent - middle) / half, -_INSIDE, _INSIDE)
+    return begin + reach * (jnp.arctanh(inside) - at)
+
+
+def _curve(bounds: tuple[float, float], start: Floats) -> tuple[float, float, Floats, Floats]:
+    """Middle and half width of what lies between the bounds, where on the curve the start lies, and the
+    free distance that is one there."""
+    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    share = np.clip((start - middle) / half, -_INSIDE, _INSIDE)
+    return middle, half, np.arctanh(share), half * (1.0 - share**2)
 
 
 @dataclass(frozen=True)
@@ -318,15 +336,12 @@ def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
             " for a weak one"
         )
-    return Leaf(
-        name,
-        value.shape,
-        kind,
-        step,
-        runs if asked.each_run else 0,
-        prior / step,
-        _bounds(name, value, kind, step, asked.bounds),
-    )
+    leaf = Leaf(name, value.shape, kind, step, runs if asked.each_run else 0, prior / step)
+    bounds = _bounds(name, value, kind, step, asked.bounds)
+    if bounds is None:
+        return leaf
+    numbers = replace(leaf, runs=0).to_free(jnp.asarray(value))
+    return replace(leaf, bounds=bounds, middle=tuple(np.asarray(numbers).tolist()))
 
 
 def _bounds(name: str, value: Any, kind: str, step: float, asked: Any) -> Any:
@@ -387,6 +402,10 @@ def with_axes(
         for name, leaf, dim in zip(names, leaves, dims, strict=True)
     ]
     return as_arrays(params._replace(noise=jax.tree.unflatten(structure, changed)))
+
+
+SCALED = ("noise.", "initial.")
+"""The sections that `scaled` scales."""
 
 
 def scaled(params: Parameters, factor: float) -> Parameters:

@@ -15,7 +15,7 @@ from jaxekf.storage import SCHEMA_VERSION
 from tuning.cautions import cautions
 from tuning.frame import TRUTH_UNITS
 from tuning.information import interval
-from tuning.noise import Leaf
+from tuning.noise import SCALED, Leaf
 from tuning.validation import Row, as_dicts
 
 if TYPE_CHECKING:  # Both come after this module, which `Tuned.save` needs.
@@ -73,6 +73,7 @@ def record(
         "evaluations": int(tuned.evaluations),
         "rejected_steps": int(tuned.rejections),
         "covariance_scale": float(tuned.scale),
+        "also_scaled": _also_scaled(tuned),
         "history": [
             {
                 "number": int(step.number),
@@ -153,6 +154,16 @@ def _units(tuned: "Tuned") -> dict[str, str]:
     return {leaf.name: units[leaf.name] for leaf in tuned.layout.leaves}
 
 
+def _also_scaled(tuned: "Tuned") -> list[str]:
+    """Noise and initial belief that were not free, where the common scale changed them."""
+    if tuned.scale == 1.0:
+        return []
+    free = {leaf.name for leaf in tuned.layout.leaves}
+    return [
+        name for name in leaf_names(tuned.params) if name.startswith(SCALED[0]) and name not in free
+    ]
+
+
 def _truth(tuned: "Tuned") -> dict[str, Any] | None:
     """How the encoder lies to the tracker, where that was free."""
     if tuned.truth is None:
@@ -177,8 +188,8 @@ def _numbers(tuned: "Tuned") -> list[dict[str, Any]]:
         for i in range(leaf.size):
             label, logarithm = labels[at], leaf.is_logarithm(i)
             run = i // leaf.each
-            change = leaf.straight(end[at]) - leaf.straight(start[at])
-            scales = logarithm and leaf.name.startswith(("noise.", "initial."))
+            change = leaf.straight(end[at], i) - leaf.straight(start[at], i)
+            scales = logarithm and leaf.name.startswith(SCALED)
             ends = known.get(label)
             found.append(
                 {

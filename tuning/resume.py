@@ -16,7 +16,7 @@ from jaxekf.files import whole_file
 from tuning.descent import Descent
 from tuning.starts import Race
 
-_KIND = "jaxekf tuning, version 2"
+_KIND = "jaxekf tuning, version 3"
 
 
 def attach(race: Race, path: Path, asked: str) -> None:

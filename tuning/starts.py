@@ -67,6 +67,8 @@ class Race:
 
     def __post_init__(self) -> None:
         self.tries = [0] * len(self.searches)
+        self.warmed: set[int] = set()
+        self._warming: dict[str, Any] = {}
         for search in self.searches:
             search.keep = self._keep_all
 
@@ -80,14 +82,16 @@ class Race:
     def warm(self, steps: int) -> None:
         """As `Descent.warm`, for each that has not begun."""
         for i, search in enumerate(self.searches):
-            if search.history:
+            if search.history or i in self.warmed:
                 continue
             try:
-                search.warm(steps)
+                search.warm(steps, self._keep_warming, self._warming)
             except TuningError:
                 # Nothing is finite there: a drawn start begins as drawn, and `_advance` brings it nearer.
                 if i == 0:
                     raise
+            self.warmed.add(i)
+            self._keep_warming({})
 
     @property
     def _leader(self) -> int:
@@ -184,6 +188,10 @@ class Race:
         search = self.searches[i]
         return float("inf") if search.best is None else search.judged(search.best.step)
 
+    def _keep_warming(self, state: dict[str, Any]) -> None:
+        self._warming = state
+        self._keep_all({})
+
     def _keep_all(self, _: dict[str, Any]) -> None:
         if self.keep is not None:
             self.keep(self.state_dict())
@@ -194,9 +202,11 @@ class Race:
         found["won"] = np.array(self.won)
         found["out"] = np.array(list(self.dropped), int)
         found["why_out"] = np.array(list(self.dropped.values()), str)
+        found["warmed"] = np.array(sorted(self.warmed), int)
+        found |= {f"warming_{name}": v for name, v in self._warming.items()}
         for i, search in enumerate(self.searches):
-            if search.best is not None:
-                found |= {f"start{i}_{name}": v for name, v in search.state_dict().items()}
+            state = search.state_dict() if search.best is not None else search.beginning()
+            found |= {f"start{i}_{name}": v for name, v in state.items()}
         return found
 
     def restore(self, kept: dict[str, Any]) -> None:
@@ -206,11 +216,15 @@ class Race:
         self.dropped = {
             int(i): str(why) for i, why in zip(kept["out"], kept["why_out"], strict=True)
         }
+        self.warmed = {int(i) for i in kept["warmed"]}
+        self._warming = _under("warming_", kept)
         for i, search in enumerate(self.searches):
-            mine = f"start{i}_"
-            own = {k.removeprefix(mine): v for k, v in kept.items() if k.startswith(mine)}
-            if own:
-                search.restore(own)
+            search.restore(_under(f"start{i}_", kept))
+
+
+def _under(prefix: str, kept: dict[str, Any]) -> dict[str, Any]:
+    """What stands under names with a prefix, by the rest of the name."""
+    return {k.removeprefix(prefix): v for k, v in kept.items() if k.startswith(prefix)}
 
 
 def line_up(make: Callable[..., Descent], count: int, seed: int) -> Race:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxekf.errors import RecordingError
+from jaxekf.rows import Intake
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -158,6 +159,8 @@ class Recording:
     ``q_body_object`` (the point and frame of the tool that is asked for), licence, seed."""
     path: Path | None = None
     markers: Markers | None = None
+    intake: Mapping[str, Intake] = field(default_factory=dict)
+    """What became of the rows of each stream's source while it was read; empty of a run made in memory."""
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):

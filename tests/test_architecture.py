@@ -13,8 +13,9 @@ ROOT = Path(__file__).parents[1]
 # A module may import those before it. What stands in one entry does not import its neighbours.
 ORDER = [
     ("errors",),
+    ("rows",),
     ("rotation", "linalg", "recording", "files"),
-    ("densities", "rest"),
+    ("densities", "rest", "intake"),
     ("allan",),
     ("manifold", "tables", "truth", "description", "streams"),
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),

@@ -1,0 +1,293 @@
+"""What becomes of the rows of a stream while it is read: used, masked or dropped, by reason and place.
+
+Whatever a stream was read from (CSV, HDF5, NPZ, another program's file), its rows are judged here, so
+that a fault has the same end everywhere. A row that is masked is there but not to be believed; one that
+is dropped is no sample at all.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxekf.recording import Encoder, Flags, Floats, Imu, Optical, Times
+from jaxekf.rows import Indices, Intake, Place, Reason
+
+MOST_BAD_NORMS = 0.05
+"""Share of rows with a norm that is no quaternion's, over which the columns are something else."""
+NORM_ROUNDED, NORM_WRONG = 1e-3, 0.1
+SLOWEST_S = 0.5
+"""Median step from which on a stream is taken for one whose times are in another unit."""
+STATUS_OK = ("ok", "0")
+"""Words of a status that mean a good sample, unless others are stated; in lower case."""
+NDI_STATUS = {
+    "3": "partly out of volume",
+    "5": "partial",
+    "9": "out of volume",
+    "17": "bad fit",
+    "20": "fell behind",
+    "31": "missing",
+}
+"""What numbers of NDI trackers mean."""
+
+
+def optical(
+    place: Place,
+    time_ns: Times,
+    quaternion: Floats,
+    position: Floats | None = None,
+    *,
+    status: Sequence[str] | None = None,
+    status_ok: Sequence[str] = STATUS_OK,
+    error: Floats | None = None,
+    error_max: float = np.inf,
+    sort: bool = False,
+    **said: Any,
+) -> tuple[Optical, Intake]:
+    """A tracker's poses (w, x, y, z, body to reference; metres; NaN where blank), bad rows masked.
+
+    `status` (N,) are words of which `status_ok` (any case) mean a good row; rows whose reported fit
+    `error` (N,), metres, exceeds `error_max` are masked. `said` are further fields of `Optical`. Raises
+    `RecordingError` where no row is usable, and what `in_order`, `check_rate` and `judge_quaternions` do.
+    """
+    numbers = [a for a in (quaternion, position, error) if a is not None]
+    order, account = in_order(place, time_ns, numbers, sort=sort)
+    place, time_ns = place.take(order), time_ns[order]
+    check_rate(place, time_ns)
+    quaternion = quaternion[order]
+    position = None if position is None else position[order]
+    error = None if error is None else error[order]
+    reasons: dict[str, Flags] = {}
+    if status is not None:
+        words = np.array([str(status[i]).strip().lower() for i in order], str)
+        good = {str(word).strip().lower() for word in status_ok}
+        for word in np.unique(words):
+            if word not in good:
+                meaning = NDI_STATUS.get(word)
+                name = f"status {word}" if meaning is None else f"status {word} ({meaning})"
+                reasons[name] = words == word
+    # Only what is said to be good is judged as a quaternion; the rest may hold anything.
+    hidden = np.zeros(len(time_ns), bool)
+    for bad in reasons.values():
+        hidden |= bad
+    unit, lost, notes = judge_quaternions(place, np.where(hidden[:, None], np.nan, quaternion))
+    reasons |= lost
+    if position is not None:
+        reasons["position not finite"] = ~np.isfinite(position).all(axis=1)
+    if error is not None:
+        with np.errstate(invalid="ignore"):
+            reasons[f"fit error over {error_max:g} m"] = error > error_max
+    valid, account = mask_first(place, time_ns, account, reasons)
+    if not valid.any():
+        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
+        raise place.error(
+            None,
+            None,
+            f"no usable row among {account.rows} ({told})",
+            "at least one",
+            "a run in which the tool is seen, or stating the status words that are good (status_ok)",
+        )
+    account = replace(account, notes=(*account.notes, *notes))
+    return Optical(time_ns, unit, valid, position, error=error, **said), account
+
+
+def imu(
+    place: Place,
+    time_ns: Times,
+    gyroscope: Floats,
+    accelerometer: Floats | None = None,
+    magnetometer: Floats | None = None,
+    *,
+    sort: bool = False,
+) -> tuple[Imu, Intake]:
+    """An IMU's samples, SI units; rows of which gyroscope or accelerometer is not finite are masked: they
+    are left out of the stream, for an input cannot be masked.
+
+    A magnetometer may be slower than the rest: where it is not finite it was not read. Raises
+    `RecordingError` where no row is finite, and what `in_order` and `check_rate` raise.
+    """
+    numbers = [a for a in (gyroscope, accelerometer, magnetometer) if a is not None]
+    order, account = in_order(place, time_ns, numbers, sort=sort)
+    place, time_ns = place.take(order), time_ns[order]
+    check_rate(place, time_ns)
+    needed = [a[order] for a in (gyroscope, accelerometer) if a is not None]
+    bad = ~np.isfinite(np.concatenate(needed, axis=1)).all(axis=1)
+    valid, account = mask_first(place, time_ns, account, {"not finite": bad})
+    if not valid.any():
+        raise place.error(
+            None, None, f"no finite row among {account.rows}", "at least one", "recording again"
+        )
+    chosen = order[valid]
+    streams = [None if a is None else a[chosen] for a in (gyroscope, accelerometer, magnetometer)]
+    gyro, *others = streams
+    assert gyro is not None
+    return Imu(time_ns[valid], gyro, *others), account
+
+
+def encoder(
+    place: Place,
+    time_ns: Times,
+    quaternion: Floats,
+    position: Floats | None = None,
+    *,
+    scored: Flags | None = None,
+    sort: bool = False,
+) -> tuple[Encoder, Intake]:
+    """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked.
+
+    A position that is not known is NaN. Raises what `in_order`, `check_rate` and `judge_quaternions` raise.
+    """
+    scored = np.ones(len(time_ns), bool) if scored is None else scored
+    numbers = [quaternion, scored.astype(float)]
+    numbers += [] if position is None else [position]
+    order, account = in_order(place, time_ns, numbers, sort=sort)
+    place, time_ns = place.take(order), time_ns[order]
+    unit, lost, notes = judge_quaternions(place, quaternion[order])
+    valid, account = mask_first(place, time_ns, account, lost)
+    account = replace(account, notes=(*account.notes, *notes))
+    position = None if position is None else position[order]
+    return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
+
+
+def in_order(
+    place: Place, time_ns: Times, data: Sequence[Floats], *, sort: bool = False
+) -> tuple[Indices, Intake]:
+    """Rows in order of time, each time once, and what was dropped.
+
+    A row with the time and all numbers of the one before is dropped. Raises `RecordingError` for one of the
+    same time with other numbers, and for time that runs backwards, unless `sort` puts it right.
+    """
+    order, notes = np.arange(len(time_ns)), ()
+    early = np.flatnonzero(np.diff(time_ns) < 0)
+    if early.size and not sort:
+        at = int(early[0]) + 1
+        raise place.error(
+            at,
+            "time",
+            f"{_seconds(time_ns[at])} s after {_seconds(time_ns[at - 1])} s",
+            "times that increase",
+            "splitting logs that were put together, or --sort to order the rows by time",
+        )
+    if early.size:
+        late = int(np.sum(time_ns < np.maximum.accumulate(time_ns)))
+        order = np.argsort(time_ns, kind="stable")
+        notes = (f"{late} rows were out of order and are sorted by time",)
+    time = time_ns[order]
+    again = np.flatnonzero(np.diff(time) == 0) + 1
+    if again.size:
+        flat = np.concatenate([np.reshape(d, (len(time_ns), -1)) for d in data], axis=1)[order]
+        one, other = flat[again], flat[again - 1]
+        same = ((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1)
+        if not same.all():
+            at = int(order[again[np.argmin(same)]])
+            raise place.error(
+                at,
+                "time",
+                f"{_seconds(time_ns[at])} s twice with other numbers",
+                "each time once",
+                "exporting times with more digits, or removing one of the rows",
+            )
+    kept = np.ones(len(time), bool)
+    kept[again] = False
+    dropped = {}
+    if again.size:
+        dropped["repeated"] = reasoned(place, order[again], time[again])
+    return order[kept], Intake(len(time_ns), {}, dropped, notes, place.unit)
+
+
+def reasoned(place: Place, rows: Indices, time_ns: Times) -> Reason:
+    """The reason of rows (n,) of a place, which have these stamps."""
+    numbers = np.array([place.number(row) for row in rows], np.intp)
+    order = np.argsort(numbers, kind="stable")
+    return Reason(numbers[order], time_ns[order])
+
+
+def mask_first(
+    place: Place, time_ns: Times, intake: Intake, found: Mapping[str, Flags]
+) -> tuple[Flags, Intake]:
+    """Which rows (N,) are valid where each of these is a reason to mask one, and the account of it; a row
+    counts for the first reason that holds."""
+    valid = np.ones(len(time_ns), bool)
+    masked = dict(intake.masked)
+    for name, bad in found.items():
+        rows = np.flatnonzero(bad & valid)
+        if rows.size:
+            masked[name] = reasoned(place, rows, time_ns[rows])
+            valid[rows] = False
+    return valid, replace(intake, masked=masked)
+
+
+def judge_quaternions(
+    place: Place, values: Floats, *, column: str = "qw"
+) -> tuple[Floats, dict[str, Flags], tuple[str, ...]]:
+    """Unit quaternions (N, 4) of what a tracker wrote, reasons to mask rows, and what was scaled.
+
+    What is missing (blank, not finite, zero, or of a norm that no rounding explains) becomes the identity.
+    Raises `RecordingError` where more than 5 % of the rows are of such a norm: these are no quaternions.
+    """
+    blank = np.isnan(values).all(axis=1)
+    lost = ~np.isfinite(values).all(axis=1)
+    # Scaled first, so that no square overflows.
+    size = np.max(np.abs(np.where(lost[:, None], 0.0, values)), axis=1, initial=0.0)
+    safe = np.where(size > 0.0, size, 1.0)
+    norm = safe * np.linalg.norm(np.where(lost[:, None], 0.0, values) / safe[:, None], axis=1)
+    zero = ~lost & (norm < 1e-9)
+    off = np.abs(norm - 1.0)
+    wrong = ~lost & ~zero & (off > NORM_WRONG)
+    there = ~lost & ~zero
+    if wrong.sum() > MOST_BAD_NORMS * max(int(there.sum()), 1) and wrong.sum() > 1:
+        first = int(np.flatnonzero(wrong)[0])
+        raise place.error(
+            first,
+            column,
+            f"a norm of {norm[first]:.4g}, and {wrong.sum()} of {there.sum()} quaternions off by more"
+            f" than {NORM_WRONG:g}",
+            "quaternions of norm 1",
+            "checking which columns hold the quaternion",
+        )
+    good = there & ~wrong
+    rounded = good & (off > NORM_ROUNDED)
+    unit = np.zeros_like(values)
+    unit[:, 0] = 1.0
+    unit[good] = values[good] / norm[good, None]
+    # What is a unit quaternion to rounding stays to the last bit, so that what is saved is read again.
+    exact = good & (off < 1e-15)
+    unit[exact] = values[exact]
+    notes: tuple[str, ...] = ()
+    if rounded.any():
+        first, last = (place.number(row) for row in np.flatnonzero(rounded)[[0, -1]])
+        notes = (
+            f"{rounded.sum()} quaternions are scaled to norm 1, off by up to {off[rounded].max():.2g}"
+            f" ({place.unit}s {first} to {last})",
+        )
+    reasons = {
+        "blank": blank,
+        "not finite": lost & ~blank,
+        "missing tool (zero quaternion)": zero,
+        "norm off by more than 0.1": wrong,
+    }
+    return unit, reasons, notes
+
+
+def check_rate(place: Place, time_ns: Times) -> None:
+    """Raise `RecordingError` where the rate that the times imply is that of another unit."""
+    if len(time_ns) < 3:
+        return
+    step = float(np.median(np.diff(time_ns))) * 1e-9
+    if step < SLOWEST_S:
+        return
+    for unit, factor in (("ms", 1e3), ("µs", 1e6), ("ns", 1e9)):
+        rate = factor / step
+        if 2.0 < rate <= 2e4:
+            raise place.error(
+                None,
+                "time",
+                f"a sample every {step:.6g} s",
+                f"a rate of more than {1.0 / SLOWEST_S:g} Hz (in {unit} it would be {rate:.4g} Hz)",
+                f'stating the unit of its times: time_unit = "{unit}"',
+            )
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{int(time_ns) / 1e9:.9f}".rstrip("0").rstrip(".")

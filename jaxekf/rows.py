@@ -73,6 +73,8 @@ class Intake:
     notes: tuple[str, ...] = ()
     """What else was done, in sentences."""
     unit: str = "line"
+    numbers: Indices | None = None
+    """(N,) line or sample of each sample of the stream, which may be fewer than rows."""
 
     def sentences(self, label: str) -> tuple[str, ...]:
         """One warning for each reason, with count and first and last place."""

@@ -10,51 +10,60 @@ Folders are written whole or not at all.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
 
-from jaxekf import description, encoder_storage, marker_storage
-from jaxekf.description import SCHEMA_VERSION
+from jaxekf import description, encoder_storage, intake, marker_storage, stated
+from jaxekf.description import SCHEMA_VERSION, Source
 from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_folder
-from jaxekf.recording import Floats, Imu, Optical, Recording, unit_quaternions
+from jaxekf.intake import without_repeats
+from jaxekf.recording import Floats, Imu, Optical, Recording, Times
+from jaxekf.rows import Intake, Reason
 from jaxekf.tables import (
     POSITION,
     QUATERNION,
     Sheet,
     Table,
-    finite_numbers,
     need_columns,
     numbers,
     read_table,
-    read_times,
     reported,
+    stamps,
+    words,
     write_sheet,
 )
 
 __all__ = ["SCHEMA_VERSION", "joint_attitude", "load", "load_imu", "save"]
 
 
-def load(path: Path | str) -> Recording:
+def load(path: Path | str, *, sort: bool = False) -> Recording:
     """Read a recorded run. Raises `RecordingError`, which names file, line and column.
 
     What `recording.toml` says besides becomes `Recording.info`: its own entries by their names (see
-    `description.facts`), and what is left of a stream's section as ``optical_about`` and so on.
+    `description.facts`), and what is left of a stream's section as ``optical_about`` and so on. Rows that
+    are not to be believed are masked and those that are none dropped: `Recording.intake` has the account.
+    With `sort` rows that are out of order are put in order of time.
     """
     folder = Path(path)
     about = description.read_description(folder)
     place = folder / description.FILE
-    for label, form in _FORMS.items():
-        description.check_section(place, label, about.get(label, {}), form.described)
     read: dict[str, Any] = {}
+    accounts: dict[str, Intake] = {}
     for label, form in _FORMS.items():
-        file = folder / f"{label}.csv"
+        section = about.get(label, {})
+        description.check_section(place, label, section, form.described)
+        how = stated.layout(label, section, place)
+        file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
-            read[label] = form.read(read_table(file), about.get(label, {}))
+            table = read_table(file, how)
+            stream, account = form.read(table, Source(section, place, sort))
+            read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
         files = " or ".join(f"{label}.csv" for label in _FORMS)
         raise RecordingError(folder, "no stream", files, "another folder")
@@ -62,13 +71,26 @@ def load(path: Path | str) -> Recording:
     info |= description.facts(info, place)
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
-    return Recording(name, **read, info=info, path=folder)
+    return without_repeats(Recording(name, **read, info=info, path=folder, intake=accounts))
 
 
 def load_imu(path: Path | str) -> Recording:
     """An IMU alone, from a CSV file with the columns of `imu.csv`."""
     file = Path(path)
-    return Recording(file.stem, imu=_read_imu(read_table(file), {}), path=file)
+    table = read_table(file)
+    imu, account = _read_imu(table, Source({}, file, False))
+    account = _completed(account, table, imu.time_ns)
+    return Recording(file.stem, imu=imu, path=file, intake={"imu": account})
+
+
+def _completed(account: Intake, table: Table, time_ns: Times) -> Intake:
+    """With the rows that the file ends in the middle of, and how it was read."""
+    account = replace(account, notes=(*table.text.notes, *account.notes))
+    if not table.text.cut:
+        return account
+    lines = np.array(table.text.cut, np.intp)
+    reason = Reason(lines, np.repeat(time_ns[-1:], len(lines)))
+    return replace(account, rows=account.rows + len(lines)).with_masked("cut short", reason)
 
 
 def save(
@@ -96,29 +118,31 @@ def save(
     return Path(path)
 
 
-def _read_optical(table: Table, about: Mapping[str, Any]) -> Optical:
+def _read_optical(table: Table, source: Source) -> tuple[Optical, Intake]:
     need_columns(table, "time,qw,qx,qy,qz[,x,y,z][,status][,error]")
-    place = table.path.with_name(description.FILE)
-    q, valid = unit_quaternions(numbers(table, QUATERNION, blank=True))
-    position = p_body_tool = None
+    about, place = source.about, source.place
+    turning = stated.turning("optical", about, place)
+    _, length = stated.factors("optical", about, place)
+    position = p_body_tool = status = None
     if set(POSITION) <= set(table.columns):
-        position = numbers(table, POSITION, blank=True)
+        position = length * numbers(table, POSITION, blank=True)
     if "status" in table.columns:
-        at = table.columns.index("status")
-        words = about.get("status_ok", ["ok", "0"])
-        words = words if isinstance(words, list) else [words]
-        good = {str(word).strip().lower() for word in words}
-        valid &= np.array([row[at].strip().lower() in good for row in table.rows])
+        status = words(table, "status")
     if "p_body_tool" in about:
         p_body_tool = description.finite_vector(
             about["p_body_tool"], 3, place, "optical.p_body_tool"
         )
-    return Optical(
-        read_times(table),
-        q,
-        valid,
+    error = reported(table, "error", least=0.0)
+    return intake.optical(
+        table.place,
+        stamps(table),
+        turning.standard(numbers(table, turning.columns(table.columns), blank=True)),
         position,
-        error=reported(table, "error", least=0.0),
+        status=status,
+        status_ok=description.words(about, "optical", "status_ok", intake.STATUS_OK, place),
+        error=None if error is None else length * error,
+        error_max=description.limit(about, "optical", "error_max", place),
+        sort=source.sort,
         p_body_tool=p_body_tool,
         latency_ns=description.latency_ns(about, "optical", place),
     )
@@ -141,17 +165,21 @@ def _write_optical(stream: Optical, about: dict[str, Any]) -> tuple[Sheet, dict[
     return Sheet(columns, stream.time_ns, np.concatenate(values, axis=1)), about
 
 
-def _read_imu(table: Table, about: Mapping[str, Any]) -> Imu:
+def _read_imu(table: Table, source: Source) -> tuple[Imu, Intake]:
     need_columns(table, "time,gx,gy,gz[,ax,ay,az][,mx,my,mz]")
+    rate, force = stated.factors("imu", source.about, source.place)
 
     def maybe(names: tuple[str, ...]) -> Floats | None:
-        return finite_numbers(table, names) if set(names) <= set(table.columns) else None
+        return numbers(table, names, blank=True) if set(names) <= set(table.columns) else None
 
-    return Imu(
-        read_times(table),
-        finite_numbers(table, ("gx", "gy", "gz")),
-        maybe(("ax", "ay", "az")),
+    accelerometer = maybe(("ax", "ay", "az"))
+    return intake.imu(
+        table.place,
+        stamps(table),
+        rate * numbers(table, ("gx", "gy", "gz"), blank=True),
+        None if accelerometer is None else force * accelerometer,
         maybe(("mx", "my", "mz")),
+        sort=source.sort,
     )
 
 
@@ -170,7 +198,7 @@ def _write_imu(stream: Imu, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
 class _Form(NamedTuple):
     """How a stream of `Recording` is held on disk."""
 
-    read: Callable[[Table, Mapping[str, Any]], Any]
+    read: Callable[[Table, Source], tuple[Any, Intake]]
     write: Callable[[Any, dict[str, Any]], tuple[Sheet, dict[str, Any]]]
     described: Mapping[str, str]
     """What its section of `recording.toml` says, where it says it."""
@@ -183,7 +211,7 @@ _FORMS = {
         _read_optical,
         _write_optical,
         {"kind": "pose", "quaternion": description.BODY_TO_REFERENCE, "unit": "1, m"},
-        ("status_ok", "p_body_tool", "latency"),
+        ("status_ok", "error_max", "p_body_tool", "latency"),
     ),
     "markers": _Form(
         marker_storage.read,
@@ -198,4 +226,5 @@ _FORMS = {
 
 def _left(section: Mapping[str, Any], form: _Form) -> dict[str, Any]:
     """A section without what the stream holds: each is said in one place only."""
-    return {key: value for key, value in section.items() if key not in form.held}
+    held = (*form.held, *stated.HELD)
+    return {key: value for key, value in section.items() if key not in held}

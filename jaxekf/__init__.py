@@ -18,6 +18,7 @@ from jaxekf.errors import (
 )
 from jaxekf.estimation import estimate, estimate_many
 from jaxekf.export import read_export
+from jaxekf.gaps import split_at_gaps
 from jaxekf.interpolation import InputSample
 from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
 from jaxekf.kernels import jit
@@ -105,5 +106,6 @@ __all__ = [
     "save",
     "save_parameters",
     "score",
+    "split_at_gaps",
     "timeline",
 ]

@@ -9,6 +9,7 @@ has no line, is hidden. The section ``[markers]`` holds `latency` (s), `quality_
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Floats, Markers, Times
-from jaxekf.rows import Intake, Place
+from jaxekf.rows import Intake, Part, Place
 from jaxekf.tables import (
     POSITION,
     Sheet,
@@ -54,7 +55,7 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     order, account = intake.in_order(
         table.place, stamps(table), columns, sort=source.sort, part=marker, parts=names
     )
-    times, marker = stamps(table)[order], marker[order]
+    all_marker, times, marker = marker, stamps(table)[order], marker[order]
     intake.check_rate(table.place, np.unique(times))
     first = np.concatenate([[True], np.diff(times) > 0])
     frame = np.cumsum(first) - 1
@@ -66,7 +67,18 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
         spread[frame, marker] = lines[order]
         return spread
 
-    account = _account(table.place.take(order), times, position[order], account)
+    place_of_kept = table.place.take(order)
+    lines = np.bincount(all_marker, minlength=len(names))
+    there = np.zeros((frame[-1] + 1, len(names)), bool)
+    there[frame, marker] = True
+    gone = np.setdiff1d(np.arange(len(all_marker)), order)
+    parts = {
+        name: Part(
+            int(lines[m]), stamps(table)[gone[all_marker[gone] == m]], times[first][~there[:, m]]
+        )
+        for m, name in enumerate(names)
+    }
+    account = replace(_account(place_of_kept, times, position[order], account), parts=parts)
     position = by_frame(position)
     stream = Markers(
         times[first],

@@ -43,6 +43,8 @@ class Samples:
     """Per-sample data for `predict` and `noise`: a pytree of arrays (N, ...)."""
     latency_ns: int = 0
     """How long after `time_ns` a sample was known."""
+    origin: tuple[str, ...] = ()
+    """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
 
 
 @dataclass(frozen=True)

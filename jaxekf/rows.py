@@ -62,6 +62,16 @@ class Reason:
         return len(self.numbers)
 
 
+class Part(NamedTuple):
+    """Rows of one part of a stream whose rows are of several, such as one marker's."""
+
+    rows: int
+    dropped: Times
+    """Stamps of its rows that were dropped."""
+    absent: Times
+    """Stamps of the stream's samples for which this part has no row."""
+
+
 @dataclass(frozen=True)
 class Intake:
     """What became of the rows of one stream."""
@@ -75,6 +85,9 @@ class Intake:
     unit: str = "line"
     numbers: Indices | None = None
     """(N,) line or sample of each sample of the stream, which may be fewer than rows."""
+
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    """Of each marker, by its name."""
 
     def sentences(self, label: str) -> tuple[str, ...]:
         """One warning for each reason, with count and first and last place."""

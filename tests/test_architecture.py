@@ -17,7 +17,7 @@ ORDER = [
     ("rotation", "linalg", "recording", "files"),
     ("densities", "rest", "intake", "text"),
     ("allan",),
-    ("manifold", "tables", "truth", "description", "streams"),
+    ("manifold", "tables", "truth", "description", "streams", "gaps"),
     ("stated",),
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
     ("timeline", "attitude_match"),

@@ -23,6 +23,7 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    sort_option,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.files import check_output, finite_or_null, whole_folder
@@ -33,12 +34,15 @@ from jaxekf.recording import Floats
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @model_option
+@sort_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("aligned"), show_default=True
 )
 @overwrite_option
 @json_option
-def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_json: bool) -> None:
+def align(
+    runs: tuple[Path, ...], model: str, sort: bool, output: Path, overwrite: bool, as_json: bool
+) -> None:
     """Clock offset and alignment between tracker and IMU, from the angular rates of RUNS.
 
     Latency: seconds that the tracker's samples are older than stamped, in the middle of the run, beyond
@@ -47,7 +51,7 @@ def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_
     """
     check_output(output, "align.json", overwrite=overwrite)
     chosen = get_model(model)
-    found = [align_run(recording) for recording in load_runs(runs)]
+    found = [align_run(recording) for recording in load_runs(runs, sort=sort)]
     mean = together(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:

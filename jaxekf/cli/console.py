@@ -37,6 +37,11 @@ noise_option = click.option(
     help="noise.toml, calibration.toml, or a folder that holds them; repeatable.",
 )
 
+sort_option = click.option(
+    "--sort",
+    is_flag=True,
+    help="Put rows that are out of order in order of time, instead of refusing the file.",
+)
 robust_option = click.option(
     "--robust",
     "means",

@@ -18,6 +18,7 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    sort_option,
     tuning_progress,
 )
 from jaxekf.cli.estimate import load_runs
@@ -51,6 +52,7 @@ from tuning.ways import OPTIMISERS
 )
 @model_option
 @noise_option
+@sort_option
 @click.option(
     "--objective",
     default="attitude",
@@ -160,6 +162,7 @@ def tune(
     validate: tuple[Path, ...],
     model: str,
     noise_files: tuple[str, ...],
+    sort: bool,
     objective: str,
     free: tuple[str, ...],
     own: tuple[str, ...],
@@ -193,7 +196,10 @@ def tune(
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
-    training, judging = load_runs(runs), load_runs(validate)
+    training, judging = (
+        load_runs(runs, sort=sort, model=chosen),
+        load_runs(validate, sort=sort, model=chosen),
+    )
     aim = parse(objective)
     asked = [*free, *(read_free(spec) if spec else ())]
     asked += [tuning.Free(name, each_run=True) for name in own]

@@ -1,5 +1,6 @@
 """A run cut where its IMU has a gap: over it the motion is not known, and nothing is made up."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -23,9 +24,9 @@ def longest_ns(time_ns: Times) -> float:
 def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording]]:
     """The run itself, or its parts between gaps of the IMU longer than 0.1 s (or three periods).
 
-    Returns what can be estimated and, second, what cannot: parts shorter than half a second, or in which the
-    tracker sees nothing. Every row of the source belongs to one part: the tracker's samples in a gap are
-    the part's before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
+    Returns what can be estimated and, second, what cannot: parts shorter than half a second, or in which
+    the tracker sees nothing. Every row of the source belongs to one part: the tracker's samples in a gap
+    to the part before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
     """
     if recording.imu is None:
         return [recording], []
@@ -41,7 +42,7 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
     lowest, highest = np.iinfo(np.int64).min, np.iinfo(np.int64).max
     edges = [lowest, *(int(time[i + 1]) for i in at), highest]
     good, bad = [], []
-    for k, (begin, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (begin, end) in enumerate(itertools.pairwise(edges)):
         part = _part(recording, begin, end)
         about = f"{k + 1} of {len(edges) - 1} of '{recording.name}', cut at gaps of the IMU: {told}{more}"
         part = part.replace(
@@ -55,14 +56,13 @@ def _can_be_estimated(part: Recording) -> bool:
     if part.imu is None or np.ptp(part.imu.time_ns) < _SHORTEST_S * NANOSECONDS:
         return False
     first, last = part.imu.time_ns[[0, -1]]
-    for stream in (part.optical, part.markers):
-        if stream is not None:
-            seen = (
-                stream.valid if stream is part.optical else part.need_markers().usable.any(axis=1)
-            )
-            taken = stream.time_ns[seen] - stream.latency_ns
-            return bool(((taken >= first) & (taken <= last)).any())
-    return True
+    taken = []
+    if part.optical is not None:
+        taken.append(part.optical.time_ns[part.optical.valid] - part.optical.latency_ns)
+    if part.markers is not None:
+        seen = part.markers.usable.any(axis=1)
+        taken.append(part.markers.time_ns[seen] - part.markers.latency_ns)
+    return any(bool(((t >= first) & (t <= last)).any()) for t in taken)
 
 
 def _part(recording: Recording, begin: int, end: int) -> Recording:

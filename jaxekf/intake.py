@@ -354,8 +354,8 @@ def without_repeats(recording: Recording) -> Recording:
     lost &= repeated | np.concatenate([again, [False]])
     names = {
         "frozen while the IMU moves": repeated & moves,
-        "suspicious (identity at the origin, repeated)": lost & ~told,
-        "suspicious (pose repeated exactly)": repeated & ~told,
+        "suspicious (identity at the origin, repeated)": lost & (not told),
+        "suspicious (pose repeated exactly)": repeated & (not told),
     }
     if told:
         # The first row of such a pose is no better than those that follow.

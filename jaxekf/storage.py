@@ -9,6 +9,7 @@ Times are decimal seconds, read exactly to the nanosecond. `recording.toml` says
 Folders are written whole or not at all.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -53,6 +54,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     folder = Path(path)
     about = description.read_description(folder)
     place = folder / description.FILE
+    hashes = _hashes(about, place)
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
     for label, form in _FORMS.items():
@@ -62,16 +64,42 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
             table = read_table(file, how)
+            _check_hash(table, hashes)
             stream, account = form.read(table, Source(section, place, sort))
             read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
         files = " or ".join(f"{label}.csv" for label in _FORMS)
         raise RecordingError(folder, "no stream", files, "another folder")
-    info = {key: about[key] for key in about if key not in _FORMS}
+    info = {key: about[key] for key in about if key not in (*_FORMS, "sha256")}
     info |= description.facts(info, place)
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
     return without_repeats(Recording(name, **read, info=info, path=folder, intake=accounts))
+
+
+def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
+    """What ``[sha256]`` says of the files of a run, by their names."""
+    said = about.get("sha256", {})
+    if not isinstance(said, dict) or not all(isinstance(v, str) for v in said.values()):
+        raise RecordingError(
+            place,
+            f"sha256 = {said!r}",
+            "a section with a hash for each file",
+            "correcting or removing it",
+            column="sha256",
+        )
+    return said
+
+
+def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
+    expected = hashes.get(table.path.name)
+    if expected is not None and expected.lower() != table.text.sha256:
+        raise RecordingError(
+            table.path,
+            f"content of sha256 {table.text.sha256[:12]}...",
+            f"{expected[:12]}... as recording.toml says",
+            "restoring the file, or removing its hash under [sha256] where it was changed on purpose",
+        )
 
 
 def load_imu(path: Path | str) -> Recording:
@@ -94,11 +122,18 @@ def _completed(account: Intake, table: Table, time_ns: Times) -> Intake:
 
 
 def save(
-    recording: Recording, path: Path | str, *, overwrite: bool = False, digits: int = 17
+    recording: Recording,
+    path: Path | str,
+    *,
+    overwrite: bool = False,
+    digits: int = 17,
+    hashes: bool = False,
 ) -> Path:
     """Write a run as a folder; what is hidden becomes blank cells. Returns the folder.
 
-    `load` gives the same run again; with fewer `digits`, its samples rounded. Raises `RecordingError`
+    `load` gives the same run again; with fewer `digits`, its samples rounded. With `hashes` the SHA-256 of
+    every file is in `recording.toml`, and `load` refuses files that were changed since. Raises
+    `RecordingError`
     where the folder may not be written, or the run could not be read again.
     """
     about: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "name": recording.name}
@@ -114,6 +149,11 @@ def save(
             section = _left(recording.info.get(f"{label}_about", {}), form)
             sheet, about[label] = form.write(stream, section)
             write_sheet(folder / f"{label}.csv", sheet, digits)
+        if hashes:
+            about["sha256"] = {
+                file.name: hashlib.sha256(file.read_bytes()).hexdigest()
+                for file in sorted(folder.glob("*.csv"))
+            }
         (folder / description.FILE).write_text(tomli_w.dumps(about), "utf-8")
     return Path(path)
 

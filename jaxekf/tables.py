@@ -22,6 +22,7 @@ POSITION: tuple[str, ...] = ("x", "y", "z")
 TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "µs": 3, "μs": 3, "ns": 0}
 """Powers of ten of a nanosecond."""
 
+_PER_S = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
 _NUMBER = re.compile(
     r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
 )
@@ -330,14 +331,21 @@ def stamps(table: Table) -> Times:
             try:
                 times[i + row] = parse_seconds(cell, exponent)
             except (InvalidOperation, ValueError, OverflowError):
-                raise table.error(
-                    i + int(row),
-                    "time",
-                    f"'{cell}'",
-                    f"a time in {'seconds' if table.time_unit == 's' else table.time_unit}",
-                    "correcting the cell",
-                ) from None
+                raise _no_time(table, i + int(row), cell) from None
     return times
+
+
+def _no_time(table: Table, row: int, cell: str) -> RecordingError:
+    """What is wrong with a cell that is no time; of numbers beyond 292 years, what unit they may be in."""
+    unit, hint = table.time_unit, "correcting the cell"
+    if _NUMBER.fullmatch(cell) and Decimal(cell).is_finite() and len(table) > 1:
+        other = table.cell(row - 1 if row else 1, "time")
+        if _NUMBER.fullmatch(other) and Decimal(other).is_finite():
+            step = abs(Decimal(cell) - Decimal(other))
+            fits = [u for u in ("ms", "µs", "ns") if 5e-5 < float(step) / _PER_S[u] < 0.5]
+            hint = f'stating the unit of its times: time_unit = "{fits[0]}"' if fits else hint
+    expected = "seconds" if unit == "s" else unit
+    return table.error(row, "time", f"'{cell}'", f"a time in {expected}, within 292 years", hint)
 
 
 def _plain_times(

@@ -22,7 +22,9 @@ class RecordingError(JaxekfError):
     ) -> None:
         self.path, self.line, self.column = Path(path), line, column
         place = ":".join(str(part) for part in (path, line, column) if part is not None)
-        super().__init__(f"{place}: got {got}, expected {expected}; try {hint}")
+        message = f"{place}: got {got}, expected {expected}; try {hint}"
+        # A cell that is quoted in it may hold the end of a line.
+        super().__init__(message.replace("\r", "\\r").replace("\n", "\\n"))
 
 
 class ModelError(JaxekfError):

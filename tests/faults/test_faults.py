@@ -7,6 +7,7 @@ reason with the count and the first and last line. Of every run that goes on the
 import json
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from jaxekf import simulate
 from jaxekf.cli import main
 from jaxekf.errors import RecordingError
 
+ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("folder")
 
 
@@ -549,3 +551,37 @@ def test_30_status_and_fit_error(folder):
         lines[i] = f"{lines[i].split(',')[0]},{frozen}"
     write(file, [a + b for a, b in zip(lines, shape, strict=True)])
     masked(folder, "optical", "frozen while the IMU moves", 19, 72, 90)
+
+
+def test_an_export_is_described_not_rewritten(folder):
+    """Would catch the README's own page not working: columns, degrees, g, ms, mm, no header."""
+    before = plain(folder)
+    rows = ["Logger 7", "calibrated", "Frame;Acc X;Acc Y;Acc Z;Rot Z;Rot Y;Rot X;Stamp"]
+    imu, optical = before.need_imu(), before.need_optical()
+    for i, (t, w, a) in enumerate(zip(imu.time_ns, imu.gyroscope, imu.accelerometer, strict=True)):
+        numbers = [*(a / 9.80665), *np.rad2deg(w[::-1])]
+        rows.append(";".join([str(i), *(f"{v:.12g}" for v in numbers), f"{t / 1e6:.6f}"]))
+    write(folder / "export.csv", rows)
+    rows = []
+    for i, t in enumerate(optical.time_ns):
+        pose = [*(1e3 * optical.position[i]), *np.roll(optical.q_ref_body[i], -1)]
+        cells = [f"{v:.12g}" if optical.valid[i] else "" for v in pose]
+        rows.append(",".join([f"{t / 1e9:.9f}", str(i), *cells, "OK", "0.2"]))
+    write(folder / "tracker.csv", rows)
+    for name in ("imu.csv", "optical.csv"):
+        (folder / name).unlink()
+    text = (folder / "recording.toml").read_text()
+    text = re.sub(r"\[(imu|optical)\]\n(?:(?!\[).*\n)*", "", text)
+    readme = (ROOT / "README.md").read_text("utf-8")
+    told = readme[readme.index("schema_version = 1\n\n[imu]") :].split("```")[0]
+    (folder / "recording.toml").write_text(f"{text}\n{told.split('schema_version = 1')[1]}")
+    run = plain(folder)
+    np.testing.assert_array_equal(run.imu.time_ns, imu.time_ns)
+    np.testing.assert_allclose(run.imu.gyroscope, imu.gyroscope, atol=1e-10)
+    np.testing.assert_allclose(run.imu.accelerometer, imu.accelerometer, atol=1e-9)
+    np.testing.assert_array_equal(run.optical.valid, optical.valid)
+    seen = optical.valid
+    np.testing.assert_allclose(run.optical.position[seen], optical.position[seen], atol=1e-10)
+    np.testing.assert_allclose(run.optical.q_ref_body[seen], optical.q_ref_body[seen], atol=1e-11)
+    result = call("estimate", folder, "-o", folder.parent / "own")
+    assert result.exit_code == 0, result.output

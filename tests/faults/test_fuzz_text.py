@@ -128,7 +128,7 @@ def check(run, name, data):
 @pytest.mark.long
 def test_spoilt_text(run):
     """Would catch a traceback, a hang, a row that shifts, and a number that is read as another."""
-    count, read = (10_000 if LONG else 400), 0
+    count, read = (10_000 if LONG else 200), 0
     rng = np.random.default_rng(7)
     for i in range(count):
         name = FILES[i % 3]

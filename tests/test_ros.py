@@ -362,17 +362,37 @@ def test_types_that_nobody_knows(tmp_path, kind):
     np.testing.assert_array_equal(again.imu.time_ns, START + 5_000_000 * np.arange(9))
 
 
-def test_other_definitions(tmp_path):
+@pytest.mark.parametrize("kind", ["bag", "sqlite3"])
+def test_other_definitions(tmp_path, kind):
     """A type of a known name that holds something else, read as if it were the known one."""
-    make = Maker("sqlite3")
-    path = write(tmp_path, "bag", {"/imu": (IMU, [Maker("bag").imu(START, [0] * 3, [0] * 3)])})
-    data = path.read_bytes()
-    digest = Maker("bag").store.generate_msgdef(IMU)[1].encode()
-    assert data.count(digest) >= 1
-    path.write_bytes(data.replace(digest, b"0" * len(digest)))
-    with pytest.raises(RecordingError, match="not the standard one"):
+    path, store = imu_bag(tmp_path, kind=kind), Maker(kind).store
+    known = store.generate_msgdef(IMU)[1] if kind == "bag" else store.hash_rihs01(IMU)
+    file = path if kind == "bag" else path / "metadata.yaml"
+    other = known[:-8] + "0" * 8
+    file.write_bytes(file.read_bytes().replace(known.encode(), other.encode()))
+    with pytest.raises(
+        RecordingError, match=rf"not the standard one \({other}\), expected {known}"
+    ):
         ros.load(path)
-    assert make.store.hash_rihs01(IMU).startswith("RIHS01_")
+
+
+def test_poses_that_are_not_there(tmp_path):
+    """Would catch a quaternion of NaN or 0, or a position of NaN, taken for a pose."""
+    make, nan = Maker("mcap"), float("nan")
+    odd = {2: ([nan] * 4, [0] * 3), 5: ([0] * 4, [0] * 3), 6: ([1, 0, 0, 0], [nan, 0, 0])}
+    poses = [
+        make.pose(POSE, START + 10_000_000 * i, *odd.get(i, ([1, 0, 0, 0], [1, 2, 3])))
+        for i in range(9)
+    ]
+    again = ros.load(write(tmp_path, "mcap", {"/tracker": (POSE, poses)}, make))
+    masked = again.intake["optical"].masked
+    assert {name: reason.numbers.tolist() for name, reason in masked.items()} == {
+        "blank": [2],
+        "missing tool (zero quaternion)": [5],
+        "position not finite": [6],
+    }
+    assert np.flatnonzero(~again.optical.valid).tolist() == [2, 5, 6]
+    assert again.imu is None and again.encoder is None
 
 
 def test_last_messages_beside_the_database(tmp_path):

@@ -44,8 +44,11 @@ ORDER = [
     ("signatures", "verdicts"),
     ("diagnostics",),
     ("simulate_tool",),
-    ("datasets.columns",),
+    ("datasets.columns", "datasets.bag_files"),
+    ("datasets.bags",),
+    ("datasets.ros_messages",),
     ("datasets", "datasets.adis", "datasets.asl", "datasets.broad", "datasets.demo"),
+    ("datasets.ros",),
     ("plots.style", "plots.sight"),
     (
         "plots.attitudes",

@@ -9,6 +9,8 @@ from jaxekf.errors import RecordingError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _ZIP = b"PK\x03\x04"
+_SMALLEST = 96
+"""Bytes of the first version of HDF5's superblock; of later ones, with the root group, no less."""
 
 
 def check_there(path: Path) -> None:
@@ -79,11 +81,12 @@ def check_whole_hdf5(path: Path) -> None:
             if at >= there:
                 _refuse_other(path, view[:8], there)
         stated, length = _superblock(view, at)
-        if stated > there:
+        if stated > there or there - at < _SMALLEST:
+            told = f"{stated} bytes, as its superblock says"
             raise RecordingError(
                 path,
                 f"a truncated file: {there} bytes",
-                f"{stated} bytes, as its superblock says",
+                told if there - at >= _SMALLEST else f"more than {at + _SMALLEST} bytes",
                 "copying or exporting it again",
             )
         _refuse_endless_heaps(path, view, length)

@@ -47,6 +47,7 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
     entries = _entries(recording, path)
     data = {key: entry.value for key, entry in entries.items() if key}
     # Whatever `load` would refuse is refused now, by the same code.
+    _check_declared(path, {key: np.asarray(value) for key, value in data.items()}, {})
     _assemble(path, entries[""].about, data, sort=False, own=True)
     if SUFFIXES[path.suffix.lower()] == "npz":
         entries |= {key: export.Entry(_plain(e.value), e.about) for key, e in entries.items()}

@@ -15,7 +15,7 @@ ORDER = [
     ("errors",),
     ("rows",),
     ("rotation", "linalg", "recording", "files"),
-    ("densities", "rest", "intake", "text"),
+    ("densities", "rest", "intake", "text", "container_guard"),
     ("allan",),
     ("manifold", "tables", "truth", "description", "streams", "gaps"),
     ("stated",),

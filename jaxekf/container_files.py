@@ -106,7 +106,9 @@ def _npz_content(
             )
         names.add(info.filename)
         head = name.split("/")[0]
-        if name != info.filename and (name in root or ("/" in name and head in groups)):
+        packed = name != info.filename
+        # In our groups whatever is no data set is a damaged one.
+        if (packed and name in root) or ("/" in name and head in groups and not info.is_dir()):
             members[name] = _npz_stored(path, archive, info)
         else:
             others.append(name)

@@ -62,7 +62,7 @@ def _last_member(path: Path, there: int) -> tuple[str, int]:
             if head[:4] != _ZIP:
                 break
             name_size, extra_size = (int.from_bytes(head[i : i + 2], "little") for i in (26, 28))
-            name = file.read(name_size).decode("utf-8", "replace")
+            name = file.read(name_size).decode("utf-8", "replace")[:80]
             extra, size = file.read(extra_size), int.from_bytes(head[18:22], "little")
             if size == 0xFFFFFFFF and extra[:2] == b"\x01\x00":
                 size = int.from_bytes(extra[12:20], "little")

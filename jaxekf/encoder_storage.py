@@ -62,6 +62,9 @@ def read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     stream, account = intake.encoder(
         table.place, stamps(table), q, position, scored=scored, sort=source.sort
     )
+    if "q_optical_encoder" not in about:
+        # Not even turned by nothing, which would round it.
+        return stream, account
     q = from_scipy(frame * to_scipy(stream.q_ref_body))
     return replace(stream, q_ref_body=q), account
 

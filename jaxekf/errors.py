@@ -22,9 +22,9 @@ class RecordingError(JaxekfError):
     ) -> None:
         self.path, self.line, self.column = Path(path), line, column
         place = ":".join(str(part) for part in (path, line, column) if part is not None)
-        message = f"{place}: got {got}, expected {expected}; try {hint}"
-        # A cell that is quoted in it may hold the end of a line.
-        super().__init__(message.replace("\r", "\\r").replace("\n", "\\n"))
+        told = f"{place}: got {got}, expected {expected}; try {hint}"
+        # Names and texts of a damaged file may hold anything: the message is one line that can be printed.
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in told))
 
 
 class ModelError(JaxekfError):

@@ -45,23 +45,25 @@ def optical(
     status_ok: Sequence[str] = STATUS_OK,
     error: Floats | None = None,
     error_max: float = np.inf,
+    hidden: Flags | None = None,
     sort: bool = False,
     **said: Any,
 ) -> tuple[Optical, Intake]:
     """A tracker's poses (w, x, y, z, body to reference; metres; NaN where blank), bad rows masked.
 
     `status` (N,) are words of which `status_ok` (any case) mean a good row; rows whose reported fit
-    `error` (N,), metres, exceeds `error_max` are masked. `said` are further fields of `Optical`. Raises
-    `RecordingError` where no row is usable, and what `in_order`, `check_rate` and `judge_quaternions` do.
+    `error` (N,), metres, exceeds `error_max` are masked, as are those that `hidden` (N,) names. `said` are
+    further fields of `Optical`. Raises `RecordingError` where no row is usable, and what `in_order`,
+    `check_rate` and `judge_quaternions` do.
     """
-    numbers = [a for a in (quaternion, position, error) if a is not None]
+    numbers = [a for a in (quaternion, position, error, hidden) if a is not None]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
     quaternion = quaternion[order]
     position = None if position is None else position[order]
     error = None if error is None else error[order]
-    reasons: dict[str, Flags] = {}
+    reasons: dict[str, Flags] = {} if hidden is None else {"hidden": hidden[order]}
     if status is not None:
         words = np.array([str(status[i]).strip().lower() for i in order], str)
         good = {str(word).strip().lower() for word in status_ok}
@@ -71,10 +73,10 @@ def optical(
                 name = f"status {word}" if meaning is None else f"status {word} ({meaning})"
                 reasons[name] = words == word
     # Only what is said to be good is judged as a quaternion; the rest may hold anything.
-    hidden = np.zeros(len(time_ns), bool)
+    ignored = np.zeros(len(time_ns), bool)
     for bad in reasons.values():
-        hidden |= bad
-    unit, lost, notes = judge_quaternions(place, np.where(hidden[:, None], np.nan, quaternion))
+        ignored |= bad
+    unit, lost, notes = judge_quaternions(place, np.where(ignored[:, None], np.nan, quaternion))
     reasons |= lost
     if position is not None:
         reasons["position not finite"] = ~np.isfinite(position).all(axis=1)
@@ -137,19 +139,24 @@ def encoder(
     position: Floats | None = None,
     *,
     scored: Flags | None = None,
+    hidden: Flags | None = None,
     sort: bool = False,
 ) -> tuple[Encoder, Intake]:
-    """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked.
+    """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked, as are
+    rows that `hidden` (N,) names.
 
     A position that is not known is NaN. Raises what `in_order` and `judge_quaternions` raise.
     """
     scored = np.ones(len(time_ns), bool) if scored is None else scored
-    numbers = [quaternion, scored.astype(float)]
+    hidden = np.zeros(len(time_ns), bool) if hidden is None else hidden
+    numbers = [quaternion, scored, hidden]
     numbers += [] if position is None else [position]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
-    unit, lost, notes = judge_quaternions(place, quaternion[order])
-    valid, account = mask_first(place, time_ns, account, lost)
+    hidden = hidden[order]
+    seen = np.where(hidden[:, None], np.nan, quaternion[order])
+    unit, lost, notes = judge_quaternions(place, seen)
+    valid, account = mask_first(place, time_ns, account, {"hidden": hidden} | lost)
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
     return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
@@ -158,7 +165,7 @@ def encoder(
 def in_order(
     place: Place,
     time_ns: Times,
-    data: Sequence[Floats],
+    data: Sequence[Floats | Flags],
     *,
     sort: bool = False,
     part: Indices | None = None,

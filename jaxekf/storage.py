@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import tomli_w
 
-from jaxekf import description, encoder_storage, intake, marker_storage, stated
+from jaxekf import containers, description, encoder_storage, intake, marker_storage, stated
 from jaxekf.description import SCHEMA_VERSION, Source
 from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
@@ -51,6 +51,8 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     are not to be believed are masked and those that are none dropped: `Recording.intake` has the account.
     With `sort` rows that are out of order are put in order of time.
     """
+    if containers.is_container(path):
+        return containers.load(path, sort=sort)
     folder = Path(path)
     about = description.read_description(folder)
     place = folder / description.FILE
@@ -136,6 +138,8 @@ def save(
     `RecordingError`
     where the folder may not be written, or the run could not be read again.
     """
+    if containers.is_container(path):
+        return containers.save(recording, path, overwrite=overwrite)
     about: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "name": recording.name}
     about |= {
         k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about

@@ -15,12 +15,13 @@ ORDER = [
     ("errors",),
     ("rows",),
     ("rotation", "linalg", "recording", "files"),
-    ("densities", "rest", "intake", "text"),
+    ("densities", "rest", "intake", "text", "container_guard"),
     ("allan",),
     ("manifold", "tables", "truth", "description", "streams", "gaps"),
     ("stated",),
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
-    ("timeline", "attitude_match"),
+    ("timeline", "attitude_match", "container_layout", "container_files", "container_streams"),
+    ("containers",),
     ("alignment",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),
@@ -121,7 +122,7 @@ def test_who_may_know_what(file):
     assert "matplotlib" not in tops or name.split(".")[0] == "plots"
     assert "plotly" not in tops or name.split(".")[0] == "report"
     assert "optax" not in tops
-    assert "h5py" not in tops or name == "export"
+    assert "h5py" not in tops or name in ("export", "container_files")
     assert "tuning" not in tops or name.startswith("cli")
     assert not ({"click", "rich"} & tops) or name.startswith("cli")
 

@@ -196,11 +196,9 @@ def tune(
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
-    training, judging = (
-        load_runs(runs, sort=sort, model=chosen),
-        load_runs(validate, sort=sort, model=chosen),
-    )
     aim = parse(objective)
+    training = load_runs(runs, sort=sort, model=chosen)
+    judging = load_runs(validate, sort=sort, model=chosen)
     asked = [*free, *(read_free(spec) if spec else ())]
     asked += [tuning.Free(name, each_run=True) for name in own]
     for run in training + judging if aim.needs_truth else ():

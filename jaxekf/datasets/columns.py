@@ -44,7 +44,8 @@ class Sheet(NamedTuple):
     """A comma, or None for white space."""
     width: int
     """Cells in every row."""
-    duplicates: int
+    repeated: list[tuple[int, int]]
+    """Line of each exact duplicate, and the place in `rows` of what it repeats."""
 
 
 class Columns(NamedTuple):
@@ -69,7 +70,8 @@ def read_sheet(path: Path) -> Sheet:
         ) from error
     headers: list[tuple[int, str]] = []
     first: dict[str, int] = {}
-    count = 0
+    places: dict[str, int] = {}
+    repeated: list[tuple[int, int]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         row = line.strip()
         if not row:
@@ -77,8 +79,11 @@ def read_sheet(path: Path) -> Sheet:
         if row[0] == "#" or (not first and row[:4].lower() == "time"):
             headers.append((number, row))
             continue
-        first.setdefault(row, number)
-        count += 1
+        if row in first:
+            repeated.append((number, places[row]))
+        else:
+            places[row] = len(first)
+            first[row] = number
     if not first:
         raise RecordingError(path, "0 samples", "at least one", "exporting the recording again")
     rows = list(first)
@@ -93,7 +98,7 @@ def read_sheet(path: Path) -> Sheet:
                 "completing the row or removing it",
                 line=number,
             )
-    return Sheet(path, rows, list(first.values()), headers, separator, width, count - len(first))
+    return Sheet(path, rows, list(first.values()), headers, separator, width, repeated)
 
 
 def _cells(row: str, separator: str | None) -> int:

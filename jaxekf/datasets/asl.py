@@ -150,8 +150,8 @@ def load(
 
     Rates are rad/s and specific forces m/s^2, both (N, 3) in I. A pose is not valid where its
     quaternion is zero or not near unit norm, or where any of its numbers is missing. Rows repeated
-    exactly are dropped. `intake` holds the account of both streams, by lines of their files. `info`
-    says what was read: ``imu_stream``, ``pose_stream``, ``pose_kind``
+    exactly are dropped, and a last line that is cut short. `intake` holds the account of both streams,
+    by lines of their files. `info` says what was read: ``imu_stream``, ``pose_stream``, ``pose_kind``
     (measured, estimate or unknown), ``duplicate_rows`` dropped, ``imu_noise`` where ``sensor.yaml``
     has it (rad/s/√Hz, rad/s²/√Hz, m/s²/√Hz, m/s³/√Hz), ``gravity_ref`` (approximate, m/s²) and, in
     sentences, all ``assumptions``.
@@ -443,7 +443,7 @@ def _imu(source: _Source) -> tuple[Imu, Intake]:
     time_ns = stamps(source.sheet)
     gyroscope, accelerometer = values[:, :3].copy(), values[:, 3:].copy()
     imu, account = intake.imu(_place(source), time_ns, gyroscope, accelerometer)
-    return imu, _with_repeated(account, source, time_ns)
+    return imu, _with_left_out(account, source, time_ns)
 
 
 def _optical(source: _Source, body_sensor: _Transform) -> tuple[Optical, Intake]:
@@ -459,22 +459,24 @@ def _optical(source: _Source, body_sensor: _Transform) -> tuple[Optical, Intake]
     )
     q_ref_body = from_scipy(to_scipy(sensor.q_ref_body) * body_sensor.rotation.inv())
     q_ref_body[~sensor.valid] = (1.0, 0.0, 0.0, 0.0)
-    return replace(sensor, q_ref_body=q_ref_body), _with_repeated(account, source, time_ns)
+    return replace(sensor, q_ref_body=q_ref_body), _with_left_out(account, source, time_ns)
 
 
 def _place(source: _Source) -> Place:
     return Place(source.sheet.path, np.array(source.sheet.lines, np.intp))
 
 
-def _with_repeated(account: Intake, source: _Source, time_ns: Times) -> Intake:
-    """The account with the exact duplicates that the sheet left out, wherever they stood."""
-    if not source.sheet.repeated:
-        return account
-    lines, rows = np.array(source.sheet.repeated, np.intp).T
-    reason = Reason(lines, time_ns[rows])
-    return replace(
-        account, rows=account.rows + reason.count, dropped={**account.dropped, "repeated": reason}
-    )
+def _with_left_out(account: Intake, source: _Source, time_ns: Times) -> Intake:
+    """The account with the lines that the sheet left out: exact duplicates wherever they stood, and a last
+    line that is cut short, which has the stamp of the row before it."""
+    dropped = dict(account.dropped)
+    if source.sheet.repeated:
+        lines, rows = np.array(source.sheet.repeated, np.intp).T
+        dropped["repeated"] = Reason(lines, time_ns[rows])
+    if source.sheet.cut:
+        dropped["cut short"] = Reason(np.array(source.sheet.cut, np.intp), time_ns[-1:])
+    count = len(source.sheet.repeated) + len(source.sheet.cut)
+    return replace(account, rows=account.rows + count, dropped=dropped)
 
 
 def _info(imu: _Source, pose: _Source) -> dict[str, Any]:

@@ -269,7 +269,7 @@ def _stamped(
     rate = Decimal(repr(float(RATE_HZ if rate_hz is None else rate_hz)))
     if not (rate.is_finite() and rate > 0):
         raise rows.place.error(None, None, f"a rate of {rate} Hz", "one over 0", "--rate 60")
-    told = f"Times are frame numbers over {rate:f} Hz" + (
+    told = f"Times are frame numbers over {float(rate):g} Hz" + (
         ", at which a Polaris counts (none was given)" if rate_hz is None else ", as was given"
     )
     return timed(rows, *rows.times(group.frame, header[group.frame], NANOSECONDS / rate)), told

@@ -61,7 +61,8 @@ def load(path: Path | str) -> Recording:
     imu, told = intake.imu(place, time_ns, values[:, 7:10], values[:, 4:7], values[:, 10:])
     # The semicolons are the format's own.
     account = {"imu": replace(accounted(told, source), notes=told.notes)}
-    assumptions, optical = list(_ASSUMPTIONS), None
+    assumptions: list[str] = list(_ASSUMPTIONS)
+    optical = None
     if (values[:, :4] == 0.0).all():
         assumptions.append("Every quaternion of Vicon is zero: there is no tracker in this trial.")
         reason = intake.reasoned(place, np.arange(len(time_ns)), time_ns)

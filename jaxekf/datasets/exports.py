@@ -9,10 +9,11 @@ import gzip
 import re
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -35,11 +36,38 @@ _DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _SHOWN = 12
 
 
+class Cells(Sequence[list[str]]):
+    """Lines as lists of cells, taken apart when they are asked for: a long export has millions."""
+
+    def __init__(self, texts: list[str], delimiter: str) -> None:
+        self.texts, self.delimiter = texts, delimiter
+
+    def __len__(self) -> int:
+        return len(self.texts)
+
+    @overload
+    def __getitem__(self, at: int) -> list[str]: ...
+    @overload
+    def __getitem__(self, at: slice) -> list[list[str]]: ...
+    def __getitem__(self, at: int | slice) -> list[str] | list[list[str]]:
+        if isinstance(at, slice):
+            return [self._row(text) for text in self.texts[at]]
+        return self._row(self.texts[at])
+
+    def _row(self, text: str) -> list[str]:
+        row = text.split(self.delimiter)
+        if '"' in text:
+            # What is quoted beyond measure is left as it stands, to be refused as no number.
+            with suppress(csv.Error):
+                row = next(csv.reader([text], delimiter=self.delimiter))
+        return [cell.strip() for cell in row]
+
+
 class Lines(NamedTuple):
     """A file as lines of cells, without blank ones."""
 
     path: Path
-    cells: list[list[str]]
+    cells: Cells
     """Cells of each line, without blanks around them."""
     numbers: list[int]
     """Number of each line in the file."""
@@ -74,12 +102,11 @@ class Rows(NamedTuple):
     """Rows of samples, of equal width."""
 
     path: Path
-    cells: list[list[str]]
+    cells: Cells
     numbers: Indices
     """(N,) number of the line of each."""
     cut: tuple[int, ...]
     """Lines that end too early, at the end of the file."""
-    delimiter: str
 
     @property
     def place(self) -> Place:
@@ -87,8 +114,9 @@ class Rows(NamedTuple):
 
     def take(self, chosen: Flags) -> "Rows":
         """Some of the rows."""
-        rows = [row for row, keep in zip(self.cells, chosen, strict=True) if keep]
-        return self._replace(cells=rows, numbers=self.numbers[chosen])
+        texts = [text for text, keep in zip(self.cells.texts, chosen, strict=True) if keep]
+        cells = Cells(texts, self.cells.delimiter)
+        return Rows(self.path, cells, self.numbers[chosen], self.cut)
 
     def words(self, column: int) -> list[str]:
         """Texts (N,) of a column."""
@@ -96,11 +124,11 @@ class Rows(NamedTuple):
 
     def floats(self, columns: Sequence[int], labels: Sequence[str]) -> Floats:
         """Columns (N, len(columns)) as numbers, NaN where blank. Raises `RecordingError` at a text."""
-        values = np.empty((len(self.cells), len(columns)))
-        for j, column in enumerate(columns):
-            for i, row in enumerate(self.cells):
-                cell = row[column]
-                values[i, j] = float(self._number(i, cell, labels[j])) if cell else np.nan
+        values = np.full((len(self.cells), len(columns)), np.nan)
+        for i, row in enumerate(self.cells):
+            for j, column in enumerate(columns):
+                if row[column]:
+                    values[i, j] = float(self._number(i, row[column], labels[j]))
         return values
 
     def times(self, column: int, label: str, nanoseconds: int | Decimal) -> tuple[Times, Flags]:
@@ -119,7 +147,7 @@ class Rows(NamedTuple):
     def _number(self, row: int, cell: str, label: str) -> str:
         if not _NUMBER.fullmatch(cell):
             raise self.place.error(row, label, f"'{cell}'", "a number", "correcting the cell")
-        return cell if self.delimiter == "," else cell.replace(",", ".")
+        return cell if self.cells.delimiter == "," else cell.replace(",", ".")
 
 
 def bare(cell: str) -> str:
@@ -158,22 +186,14 @@ def read_lines(path: Path | str, what: str) -> Lines:
         raise RecordingError(path, "an empty file", what, "exporting the recording again")
     counted = "\n".join(text.splitlines()[:_HEAD])
     delimiter = max(_DELIMITERS, key=lambda d: (counted.count(d), d == ","))
-    cells, numbers = [], []
-    reader = csv.reader(text.splitlines(), delimiter=delimiter)
-    try:
-        for row in reader:
-            row = [cell.strip() for cell in row]
-            if any(row):
-                cells.append(row)
-                numbers.append(reader.line_num)
-    except csv.Error as error:
-        raise RecordingError(
-            path, f"cells that cannot be told apart ({error})", what, "exporting again",
-            line=reader.line_num,
-        ) from None  # fmt: skip
-    if not cells:
+    texts, numbers = [], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.replace(delimiter, "").strip():
+            texts.append(line)
+            numbers.append(number)
+    if not texts:
         raise RecordingError(path, "an empty file", what, "exporting the recording again")
-    return Lines(path, cells, numbers, delimiter)
+    return Lines(path, Cells(texts, delimiter), numbers, delimiter)
 
 
 def _text(path: Path, what: str) -> str:
@@ -207,12 +227,11 @@ def _text(path: Path, what: str) -> str:
 
 
 def _rows(lines: Lines, begin: int, end: int, width: int) -> Rows:
-    cells, numbers, cut = [], [], []
+    texts, numbers, cut = [], [], []
     for i in range(begin, end):
         row = lines.cells[i]
-        if len(row) > width and not any(row[width:]):
-            row = row[:width]  # delimiters at the end of a row
-        if len(row) != width:
+        # Delimiters at the end of a row are no cells.
+        if len(row) < width or any(row[width:]):
             if len(row) > width or i != len(lines.cells) - 1 or i == begin:
                 raise RecordingError(
                     lines.path,
@@ -223,9 +242,9 @@ def _rows(lines: Lines, begin: int, end: int, width: int) -> Rows:
                 )
             cut.append(lines.numbers[i])
             continue
-        cells.append(row)
+        texts.append(lines.cells.texts[i])
         numbers.append(lines.numbers[i])
-    if not cells:
+    if not texts:
         raise RecordingError(
             lines.path,
             "0 samples",
@@ -233,7 +252,8 @@ def _rows(lines: Lines, begin: int, end: int, width: int) -> Rows:
             "exporting the recording again",
             line=lines.numbers[begin - 1],
         )
-    return Rows(lines.path, cells, np.array(numbers, np.intp), tuple(cut), lines.delimiter)
+    cells = Cells(texts, lines.delimiter)
+    return Rows(lines.path, cells, np.array(numbers, np.intp), tuple(cut))
 
 
 def stripped(row: Sequence[str]) -> list[str]:
@@ -293,15 +313,16 @@ def accounted(account: Intake, source: Timed, notes: Sequence[str] = ()) -> Inta
         account,
         rows=account.rows + sum(reason.count for reason in source.dropped.values()),
         dropped={**account.dropped, **source.dropped},
-        notes=(*_delimiting(source.rows), *notes, *account.notes),
+        notes=(*_delimiting(source.rows.cells), *notes, *account.notes),
     )
 
 
-def _delimiting(rows: Rows) -> tuple[str, ...]:
-    if rows.delimiter == ",":
+def _delimiting(cells: Cells) -> tuple[str, ...]:
+    if cells.delimiter == ",":
         return ()
-    notes = [f"cells are separated by {_DELIMITERS[rows.delimiter]}s"]
-    if any("," in cell and _NUMBER.fullmatch(cell) for row in rows.cells for cell in row):
+    notes = [f"cells are separated by {_DELIMITERS[cells.delimiter]}s"]
+    with_comma = (i for i, text in enumerate(cells.texts) if "," in text)
+    if any("," in cell and _NUMBER.fullmatch(cell) for i in with_comma for cell in cells[i]):
         notes.append("numbers have decimal commas")
     return tuple(notes)
 

@@ -84,7 +84,7 @@ def load(
     header = stripped(lines.cells[at])
     rows = lines.body(at, len(header))
     group, name, chosen = _chosen(lines, at, header, rows, tool)
-    rows = rows.take(chosen)._replace(cut=rows.cut)
+    rows = rows.take(chosen)
     source, clock = _stamped(rows, group, header, rate_hz)
     labels = [header[i] for i in group.pose]
     unit = unit_of(header[group.pose[4]]) or "mm"

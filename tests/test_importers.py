@@ -1,6 +1,7 @@
 """Files of other programs: NDI, Motive, Vicon and RepoIMU exports written here, and real recordings."""
 
 import gzip
+import inspect
 import json
 import os
 
@@ -12,7 +13,7 @@ from scipy.io import savemat
 import jaxekf
 from jaxekf.alignment import align
 from jaxekf.cli import main
-from jaxekf.datasets import asl, broad, formats, ndi, optitrack, repoimu, vicon
+from jaxekf.datasets import asl, broad, formats, ndi, optitrack, repoimu, ros, vicon
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Optical
 
@@ -483,6 +484,21 @@ def test_several_recordings_are_named(tmp_path):
         formats.read("broad", tmp_path)
     with pytest.raises(RecordingError, match=r"got the format 'c3d', expected one of ndi"):
         formats.read("c3d", tmp_path)
+
+
+@pytest.mark.parametrize("name", formats.FORMATS)
+def test_options_are_those_of_the_loader(name, tmp_path):
+    """An option of the command that a loader does not know, which would end in a traceback; and a file that
+    is not there."""
+    known = inspect.signature(
+        {"asl": asl.load, "ros": ros.load}.get(name, formats.FORMATS[name].load)
+    )
+    offered = {option.name for option in main.commands["import"].params}
+    for option in formats.FORMATS[name].options:
+        assert option in known.parameters and option in offered
+    refused = call(name, tmp_path / "nothing", "-o", tmp_path / "x")
+    assert refused.exit_code == 1 and "nothing" in refused.output
+    assert "expected" in refused.output and isinstance(refused.exception, SystemExit)
 
 
 # ---------------------------------------------------------------------------------------------

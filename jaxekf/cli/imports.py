@@ -35,8 +35,24 @@ _LIST = "\n".join(f"  {name:<10} {one.about}" for name, one in FORMATS.items())
     multiple=True,
     help="ndi: a word or number of the state that means a good pose; repeatable, replaces the usual ones.",
 )
-@click.option("--imu", help="asl: stream of the IMU, by name or path.")
-@click.option("--pose", help="asl: stream of the poses, by name or path.")
+@click.option("--imu", help="asl: stream of the IMU, by name or path; ros: its topic.")
+@click.option("--pose", help="asl: stream of the poses, by name or path; ros: their topic.")
+@click.option("--child-frame", help="ros: which of several transforms on one topic.")
+@click.option("--joint", help="ros: topic of the joint's angle, for truth; needs --axis.")
+@click.option("--joint-name", help="ros: which of several joints on one topic.")
+@click.option(
+    "--axis",
+    type=float,
+    nargs=3,
+    metavar="X Y Z",
+    help="ros: the joint's axis, in the tracker's frame.",
+)
+@click.option(
+    "--stamps",
+    type=click.Choice(["header", "receive"]),
+    help="ros: the headers' stamps, or when the recorder got each message.  [default: header]",
+)
+@click.option("--sort", is_flag=True, help="ros: put messages in order that are not.")
 @overwrite_option
 @json_option
 def import_run(
@@ -48,7 +64,7 @@ def import_run(
     tracker alone becomes a run by adding its imu.csv, on the same clock or within half a second of it.
     """
     check_output(output, FILE, overwrite=overwrite)
-    given = {key: value for key, value in options.items() if value not in (None, ())}
+    given = {key: value for key, value in options.items() if value not in (None, (), False)}
     for key in given:
         if key not in FORMATS[form].options:
             taken = " or ".join(name for name, one in FORMATS.items() if key in one.options)

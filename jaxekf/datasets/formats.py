@@ -55,6 +55,13 @@ def _one_trial(path: Path | str) -> Recording:
     return broad.load(place)
 
 
+def _bag(path: Path | str, **options: Any) -> Recording:
+    """A ROS bag; its readers are loaded only when there is one."""
+    from jaxekf.datasets import ros
+
+    return ros.load(path, **options)
+
+
 FORMATS: Mapping[str, Format] = {
     "ndi": Format(
         ndi.load,
@@ -71,6 +78,11 @@ FORMATS: Mapping[str, Format] = {
     ),
     "asl": Format(
         _one_asl, "EuRoC, TUM-VI and others in the ASL layout: tracker and IMU", ("imu", "pose")
+    ),
+    "ros": Format(
+        _bag,
+        "ROS 1 bag, ROS 2 bag, .mcap or .db3: tracker, IMU and a joint's angle",
+        ("imu", "pose", "child_frame", "joint", "joint_name", "axis", "stamps", "sort"),
     ),
     "broad": Format(_one_trial, "BROAD trial (.mat): tracker, IMU and truth"),
     "repoimu": Format(repoimu.load, "RepoIMU T-stick trial (.csv, .csv.gz): tracker and IMU"),

@@ -46,15 +46,17 @@ def optical(
     error: Floats | None = None,
     error_max: float = np.inf,
     hidden: Flags | None = None,
+    also: Mapping[str, Flags] | None = None,
     sort: bool = False,
     **said: Any,
 ) -> tuple[Optical, Intake]:
     """A tracker's poses (w, x, y, z, body to reference; metres; NaN where blank), bad rows masked.
 
     `status` (N,) are words of which `status_ok` (any case) mean a good row; rows whose reported fit
-    `error` (N,), metres, exceeds `error_max` are masked, as are those that `hidden` (N,) names. `said` are
-    further fields of `Optical`. Raises `RecordingError` where no row is usable, and what `in_order`,
-    `check_rate` and `judge_quaternions` do.
+    `error` (N,), metres, exceeds `error_max` are masked, as are those that `hidden` (N,) names, and those
+    (N,) that an importer knows to be bad, for the reasons `also`. `said` are further fields of `Optical`.
+    Raises `RecordingError` where no row is usable, and what `in_order`, `check_rate` and
+    `judge_quaternions` do.
     """
     numbers = [a for a in (quaternion, position, error, hidden) if a is not None]
     order, account = in_order(place, time_ns, numbers, sort=sort)
@@ -72,6 +74,7 @@ def optical(
                 meaning = NDI_STATUS.get(word)
                 name = f"status {word}" if meaning is None else f"status {word} ({meaning})"
                 reasons[name] = words == word
+    reasons |= {name: bad[order] for name, bad in (also or {}).items()}
     # Only what is said to be good is judged as a quaternion; the rest may hold anything.
     ignored = np.zeros(len(time_ns), bool)
     for bad in reasons.values():

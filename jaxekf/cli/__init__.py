@@ -1,4 +1,4 @@
-"""The command line: simulate, allan, align, estimate, tune, plot, report, demo."""
+"""The command line: simulate, import, allan, align, estimate, tune, plot, report, demo."""
 
 import click
 import jax
@@ -9,6 +9,7 @@ from jaxekf.cli.allan import allan
 from jaxekf.cli.console import Commands
 from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
+from jaxekf.cli.imports import import_run
 from jaxekf.cli.machine import prepare
 from jaxekf.cli.plot import plot
 from jaxekf.cli.report import report
@@ -27,5 +28,5 @@ def main() -> None:
     prepare()
 
 
-for command in (simulate, allan, align, estimate, tune, plot, report, demo):
+for command in (simulate, import_run, allan, align, estimate, tune, plot, report, demo):
     main.add_command(command)

@@ -12,6 +12,7 @@ from jaxekf.cli.console import (
     note,
     print_json,
     robust_option,
+    wrote,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.errors import ModelError
@@ -80,8 +81,9 @@ def plot(
         names = figures or plots.possible_figures(made, recording)
         if not names:
             note(f"{made.run}: no figure: it needs samples of a tracker and ten instants or more")
-        files += draw(made, recording, output, names)
-    for file in files:
-        note(f"wrote {file}")
+        drawn = draw(made, recording, output, names)
+        files += drawn
+        for file in drawn:
+            wrote(file)
     if as_json:
         print_json({"figures": [str(file) for file in files]})

@@ -1,6 +1,8 @@
 """Output that is written whole or not at all."""
 
 import math
+import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -143,10 +145,12 @@ def _named(made: Path, target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        named = error.filename
+        named, inner = error.filename, re.search(r"errno = (\d+)", str(error))
+        if error.errno is None and inner:  # HDF5 tells of its number in words only.
+            error.errno, error.strerror = int(inner[1]), os.strerror(int(inner[1]))
         if isinstance(named, str | Path) and Path(named).is_relative_to(made):
             error.filename = str(target / Path(named).relative_to(made))
-        elif named is None:
+        elif named is None and error.errno is not None:
             error.filename = str(target)
         raise
 

@@ -2,8 +2,6 @@
 
 import errno
 import json
-import os
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -80,12 +78,9 @@ class Commands(click.Group):
 
 def _of_system(error: OSError) -> str:
     """One sentence on what the system refused."""
-    # HDF5 tells of its number in words only.
-    inner = re.search(r"errno = (\d+)", str(error))
-    number = error.errno or (int(inner[1]) if inner else None)
-    said = error.strerror or (os.strerror(number) if number else " ".join(str(error).split()))
+    said = error.strerror or " ".join(str(error).split())
     place = f"{error.filename or 'output'}: got '{said}', expected"
-    if number in _FULL:
+    if error.errno in _FULL:
         return f"{place} room to write; free some or name an output on another disk"
     return f"{place} to read or write there; check the path and its permissions"
 

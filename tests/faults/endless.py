@@ -63,8 +63,9 @@ def tuned(folder, number):
         parameters.save(made, MODEL, params, {"tuning": str(number)})
 
 
-def write(folder, run, number):
+def write(folder, number):
     """Everything once, over what is there."""
+    run = Recording("endless", imu=Imu(np.arange(COUNT) * 8_000_000, np.ones((COUNT, 3))))
     jaxekf.save(replace(run, info={"number": number}), folder / "run", overwrite=True)
     made = estimate(number)
     made.save(folder / "result", overwrite=True, exports=["npz", "hdf5", "tum"])
@@ -79,16 +80,15 @@ def main():
     """Serve lives; the numbers go on from one to the next."""
     warnings.simplefilter("ignore")  # JAX warns of every fork.
     folder = Path(sys.argv[1])
-    time_ns = np.arange(COUNT) * 8_000_000
-    run = Recording("endless", imu=Imu(time_ns, np.ones((COUNT, 3))))
+    folder.mkdir(exist_ok=True)
     began = time.perf_counter()
-    write(folder, run, 0)
+    write(folder, 0)
     print(json.dumps({"seconds": time.perf_counter() - began}), flush=True)
     for life, line in enumerate(sys.stdin, 1):
         child = os.fork()
         if child == 0:
             for number in itertools.count(1000 * life):
-                write(folder, run, number)
+                write(folder, number)
         time.sleep(float(line))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from endless import estimate as stand_in
+from endless import write
 
 import jaxekf
 from jaxekf.cli import main
@@ -53,9 +54,8 @@ def in_a_process(arguments, given, folder):
     return found
 
 
-def same_twice(arguments, given, folder):
+def same(first, second):
     """The files of two processes, which must be equal."""
-    first, second = (in_a_process(arguments, given, folder) for _ in range(2))
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []
     return first
@@ -63,9 +63,11 @@ def same_twice(arguments, given, folder):
 
 def test_the_same_written_again_is_the_same_bytes(tmp_path):
     """Would catch clocks, random names and the order of sets in a file of any format."""
-    found = same_twice(
-        [Path(__file__).with_name("endless.py"), tmp_path / "out"], "", tmp_path / "out"
-    )
+    out, here = tmp_path / "out", tmp_path / "here"
+    here.mkdir()
+    write(here, 0)
+    writer = Path(__file__).with_name("endless.py")
+    found = same(bytes_of(here), in_a_process([writer, out], "", out))
     exports = {f"result/{name}" for name in ("estimate.h5", "estimate.npz", "trajectory.tum")}
     folders = {"result/result.json", "run/imu.csv", "params/noise.toml", "tuned/calibration.toml"}
     assert exports | folders | {"report.html"} <= set(found)
@@ -89,7 +91,7 @@ def test_the_same_made_again_is_the_same_bytes(tmp_path):
         ("plot", run, "-o", out / "figures"),
     ]
     lines = "\n".join("|".join(map(str, command)) for command in commands)
-    found = same_twice(["-c", SCRIPT], lines, out)
+    found = same(*(in_a_process(["-c", SCRIPT], lines, out) for _ in range(2)))
     # The date of a tuning stands in one known entry, nowhere else.
     today = datetime.date.today().isoformat().encode()
     dated = {name: found[name].count(today) for name in found if today in found[name]}

@@ -63,11 +63,13 @@ def same(first, second):
 
 def test_the_same_written_again_is_the_same_bytes(tmp_path):
     """Would catch clocks, random names and the order of sets in a file of any format."""
-    out, here = tmp_path / "out", tmp_path / "here"
-    here.mkdir()
-    write(here, 0)
+    out = tmp_path / "out"
+    out.mkdir()
+    write(out, 0)
+    here = bytes_of(out)
+    shutil.rmtree(out)
     writer = Path(__file__).with_name("endless.py")
-    found = same(bytes_of(here), in_a_process([writer, out], "", out))
+    found = same(here, in_a_process([writer, out], "", out))
     exports = {f"result/{name}" for name in ("estimate.h5", "estimate.npz", "trajectory.tum")}
     folders = {"result/result.json", "run/imu.csv", "params/noise.toml", "tuned/calibration.toml"}
     assert exports | folders | {"report.html"} <= set(found)

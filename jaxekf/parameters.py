@@ -156,7 +156,7 @@ def _check_together(folder: Path, documents: list[dict[str, Any]]) -> None:
     if len(tunings) > 1:
         raise RecordingError(
             folder,
-            f"noise.toml and calibration.toml of the tunings {' and '.join(map(str, tunings))}",
+            f"noise.toml and calibration.toml of the tunings {' and '.join(sorted(map(str, tunings)))}",
             "both of one, which a kill while they were written may have prevented",
             "tuning again, or naming both files if this is meant",
         )

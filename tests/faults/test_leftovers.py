@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from jaxekf import temporary
+from jaxekf import parameters, temporary
+from jaxekf.errors import RecordingError
 from jaxekf.files import whole_file, whole_folder, whole_set
+from jaxekf.models.loose import MODEL
+from jaxekf.report.tuned import _check_noise
 
 
 def dead():
@@ -125,3 +128,20 @@ def test_a_set_leaves_the_rest_of_its_folder(tmp_path):
         raise RuntimeError
     found = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*.*")}
     assert found == {"noise.toml": "2", "runs/a.toml": "2", "mine.txt": "mine"}
+
+
+def test_files_of_two_tunings_are_refused(tmp_path):
+    """Would catch what a kill between two renames left of two tunings taken for one by filter or report."""
+    for number in (1, 2):
+        parameters.save(tmp_path / f"{number}", MODEL, MODEL.parameters, {"tuning": f"t{number}"})
+    mixed = tmp_path / "1"
+    parameters.load(MODEL, mixed)
+    (tmp_path / "2" / "noise.toml").replace(mixed / "noise.toml")
+    with pytest.raises(RecordingError, match=r"of the tunings .*naming both files"):
+        parameters.load(MODEL, mixed)
+    parameters.load(MODEL, mixed / "noise.toml", mixed / "calibration.toml")
+    with pytest.raises(
+        RecordingError, match=r"the record of the tuning t1 beside noise.toml of t2"
+    ):
+        _check_noise(mixed, "t1")
+    _check_noise(mixed, "t2")

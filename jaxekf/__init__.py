@@ -11,9 +11,11 @@ from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batc
 from jaxekf.errors import (
     FilterError,
     JaxekfError,
+    MissingPackageError,
     ModelError,
     PrecisionError,
     RecordingError,
+    ResourceError,
     TuningError,
 )
 from jaxekf.estimation import estimate, estimate_many
@@ -61,6 +63,7 @@ __all__ = [
     "Known",
     "Manifold",
     "Markers",
+    "MissingPackageError",
     "Model",
     "ModelError",
     "Optical",
@@ -70,6 +73,7 @@ __all__ = [
     "PrecisionError",
     "Recording",
     "RecordingError",
+    "ResourceError",
     "Samples",
     "Score",
     "Sensor",

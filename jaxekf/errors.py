@@ -41,3 +41,11 @@ class FilterError(JaxekfError):
 
 class TuningError(JaxekfError):
     """A tuning problem is ill-posed or could not be started."""
+
+
+class ResourceError(JaxekfError):
+    """There is too little memory for what was asked; the message names the run."""
+
+
+class MissingPackageError(JaxekfError):
+    """What was asked needs a package that is not installed; the message says how to install it."""

@@ -13,12 +13,13 @@ ROOT = Path(__file__).parents[1]
 # A module may import those before it. What stands in one entry does not import its neighbours.
 ORDER = [
     ("errors",),
-    ("rows",),
-    ("rotation", "linalg", "recording", "files"),
+    ("rows", "optional", "memory"),
+    ("rotation", "linalg", "recording", "temporary"),
+    ("files",),
     ("densities", "rest", "intake", "text", "container_guard"),
     ("allan",),
     ("manifold", "tables", "truth", "description", "streams", "gaps"),
-    ("stated",),
+    ("stated", "hashes"),
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
     ("timeline", "attitude_match", "container_layout", "container_files", "container_streams"),
     ("containers",),

@@ -26,7 +26,10 @@ from jaxekf.cli.console import (
     sort_option,
 )
 from jaxekf.cli.estimate import load_runs
+from jaxekf.description import SCHEMA_VERSION
+from jaxekf.estimation import provenance
 from jaxekf.files import check_output, finite_or_null, whole_folder
+from jaxekf.hashes import inputs_of
 from jaxekf.models import get_model
 from jaxekf.recording import Floats
 
@@ -51,7 +54,8 @@ def align(
     """
     check_output(output, "align.json", overwrite=overwrite)
     chosen = get_model(model)
-    found = [align_run(recording) for recording in load_runs(runs, sort=sort)]
+    recordings = load_runs(runs, sort=sort)
+    found = [align_run(recording) for recording in recordings]
     mean = together(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:
@@ -59,15 +63,19 @@ def align(
             note(f"{run.run}: {text}")
     for text in (*mean.sentences(), *sentences):
         note(text)
+    made_of = provenance() | {"inputs": inputs_of(recordings)}
     document = {
+        "schema_version": SCHEMA_VERSION,
+        "kind": "jaxekf alignment",
         "model": chosen.name,
         "runs": [_run(run) for run in found],
         "together": _together(mean),
         "calibration": parameters.to_document(chosen, params, {})["calibration"],
         "notes": [*mean.sentences(), *sentences],
+        "provenance": made_of,
     }
     with whole_folder(output, "align.json", overwrite=overwrite) as folder:
-        origin = {"aligned": [run.run for run in found]}
+        origin = {"aligned": [run.run for run in found]} | made_of
         parameters.save_calibration(folder, chosen, params, origin)
         text = json.dumps(finite_or_null(document), indent=2)
         (folder / "align.json").write_text(text + "\n", "utf-8")

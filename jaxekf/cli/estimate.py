@@ -7,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import manifold, metrics, parameters, storage
+from jaxekf import manifold, memory, metrics, parameters, storage
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -18,6 +18,7 @@ from jaxekf.cli.console import (
     print_table,
     robust_option,
     sort_option,
+    wrote,
 )
 from jaxekf.diagnostics import Diagnosis, diagnose, diagnose_many
 from jaxekf.errors import RecordingError
@@ -41,7 +42,10 @@ def load_runs(
 
     What was masked or dropped is said. For a `model` that an IMU drives a run is cut at the IMU's gaps.
     """
-    recordings = [storage.load(path, sort=sort) for path in paths]
+    recordings = []
+    for path in paths:
+        with memory.for_runs([path.name]):
+            recordings.append(storage.load(path, sort=sort))
     names = [recording.name for recording in recordings]
     for path, name in zip(paths, names, strict=True):
         if names.count(name) > 1:
@@ -186,21 +190,25 @@ def estimate(
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
     if online:
-        estimates = [estimate_online(recording, chosen, params) for recording in recordings]
+        made_of = (estimate_online(recording, chosen, params) for recording in recordings)
     else:
-        estimates = estimate_many(recordings, chosen, params, smooth=smooth, at=requested)
-    summaries = []
-    for made, recording in zip(estimates, recordings, strict=True):
-        diagnosis = diagnose(made, recording)
-        folder = made.save(
-            output / recording.name,
-            overwrite=overwrite,
-            exports=exports,
-            diagnosis=diagnosis.as_dict(curves=True),
-        )
-        summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+        made_of = iter(estimate_many(recordings, chosen, params, smooth=smooth, at=requested))
+    estimates, summaries = [], []
+    # One after the other as far as can be: what is finished is on the disk should the next one be stopped.
+    for recording in recordings:
+        with memory.for_runs([recording.name]):
+            made = next(made_of)
+            diagnosis = diagnose(made, recording)
+            folder = made.save(
+                output / recording.name,
+                overwrite=overwrite,
+                exports=exports,
+                diagnosis=diagnosis.as_dict(curves=True),
+            )
+            summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+        estimates.append(made)
         warn(made, diagnosis)
-        note(f"wrote {folder}")
+        wrote(folder)
     document = {"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries}
     if len(recordings) > 1:
         pooled = diagnose_many(estimates, recordings)

@@ -13,6 +13,7 @@ from jaxekf.cli.console import (
     print_json,
     robust_option,
     sort_option,
+    wrote,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.errors import ModelError
@@ -83,8 +84,9 @@ def plot(
         names = figures or plots.possible_figures(made, recording)
         if not names:
             note(f"{made.run}: no figure: it needs samples of a tracker and ten instants or more")
-        files += draw(made, recording, output, names)
-    for file in files:
-        note(f"wrote {file}")
+        drawn = draw(made, recording, output, names)
+        files += drawn
+        for file in drawn:
+            wrote(file)
     if as_json:
         print_json({"figures": [str(file) for file in files]})

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import tuning
-from jaxekf import parameters
+from jaxekf import memory, parameters
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import (
     json_option,
@@ -20,6 +20,7 @@ from jaxekf.cli.console import (
     print_table,
     sort_option,
     tuning_progress,
+    wrote,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.cli.folds import (
@@ -229,7 +230,7 @@ def tune(
         unseen = held_out(training, folds, **asked_beside, **options)
         if not as_json:
             print_folds(unseen)
-    with tuning_progress(iterations) as progress:
+    with memory.for_runs([run.name for run in training]), tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuned.save(output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
@@ -254,7 +255,8 @@ def tune(
 
 def _note(tuned: tuning.Tuned, output: Path) -> None:
     """Where it is, how it ended, and what to know of it."""
-    note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
+    wrote(output / "noise.toml")
+    note(f"{tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
     for label, more in tuned.open.items():

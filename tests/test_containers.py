@@ -214,6 +214,7 @@ def test_markers_of_others(tmp_path):
         assert run.markers.visible.sum() == 11 and not run.markers.visible[4, 1]
         account = run.intake["markers"]
         assert account.rows == 14 and account.dropped["repeated"].count == 2
+        assert account.parts["A"].rows == 7 and len(account.parts["A"].dropped) == 1
         assert list(account.masked["position not finite"].numbers) == [5]
 
 

@@ -111,6 +111,8 @@ def _npz_content(
         if (packed and name in root) or ("/" in name and head in groups and not info.is_dir()):
             members[name] = _npz_stored(path, archive, info)
         else:
+            # Where the directory and the member itself tell other names, a name of ours may be damaged.
+            archive.open(info).close()
             others.append(name)
     check_sizes(path, members)
     said = {n: _text(path, n, members.pop(n)) for n in list(members) if n in root or "@" in n}

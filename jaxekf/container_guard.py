@@ -9,6 +9,7 @@ from jaxekf.errors import RecordingError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _ZIP = b"PK\x03\x04"
+_SMALLEST_HEAP = 4096
 _SMALLEST = 96
 """Bytes of the first version of HDF5's superblock; of later ones, with the root group, no less."""
 
@@ -113,24 +114,28 @@ def _superblock(view: Any, at: int) -> tuple[int, int]:
 
 
 def _refuse_endless_heaps(path: Path, view: Any, length_size: int) -> None:
-    """Raise where texts of any length stand in a heap over which the HDF5 library would never end.
+    """Raise where texts of any length stand in a heap over which the HDF5 library might never end.
 
-    It walks a heap's objects by their size; a free one (number 0) of size 0 keeps it where it is.
+    It walks a heap's objects by their size, modulo 2^64; a free one (number 0) of size 0, or what an object
+    that runs past the end leads to, keeps it where it is.
     """
-    head = 8 + length_size
-    at = -1
+    head, at = 8 + length_size, -1
+    aligned = (head + 7) // 8 * 8
     while (at := view.find(b"GCOL\x01", at + 1)) >= 0:
-        end = at + int.from_bytes(view[at + 8 : at + head], "little")
-        step, here = 1, at + (head + 7) // 8 * 8
-        while step and here + head <= min(end, len(view)):
+        size = int.from_bytes(view[at + 8 : at + head], "little")
+        end, here = at + size, at + aligned
+        if size < _SMALLEST_HEAP or end > len(view):
+            # The library refuses it itself, or these are bytes of some number.
+            continue
+        while here + aligned <= end:
             size = int.from_bytes(view[here + 8 : here + head], "little")
             number = int.from_bytes(view[here : here + 2], "little")
-            step = (head + 7) // 8 * 8 + (size + 7) // 8 * 8 if number else size
+            step = aligned + (size + 7) // 8 * 8 if number else size
+            if step == 0 or here + step > end:
+                raise RecordingError(
+                    path,
+                    f"a damaged heap of texts at byte {here}",
+                    "a whole HDF5 file",
+                    "copying or exporting it again",
+                )
             here += step
-        if not step:
-            raise RecordingError(
-                path,
-                f"a damaged heap of texts at byte {here}",
-                "a whole HDF5 file",
-                "copying or exporting it again",
-            )

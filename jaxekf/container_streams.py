@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxekf import description, intake
 from jaxekf.recording import Encoder, Imu, Markers, Optical
-from jaxekf.rows import Intake, Place
+from jaxekf.rows import Intake, Part, Place
 
 
 def optical(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Optical, Intake]:
@@ -63,7 +63,9 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
         reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
         for reason, r in account.dropped.items()
     }
-    account = replace(account, rows=len(time) * count, dropped=repeated)
+    again = [r.time_ns for r in account.dropped.values()]
+    parts = {name: Part(len(time), np.concatenate([*again, time[:0]]), time[:0]) for name in names}
+    account = replace(account, rows=len(time) * count, dropped=repeated, parts=parts)
     seen, account = intake.mask_first(kept.take(each), time[order][each], account, reasons)
     reported = {
         key: values if values is None else values[order]

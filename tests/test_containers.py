@@ -214,6 +214,7 @@ def test_markers_of_others(tmp_path):
         assert run.markers.visible.sum() == 11 and not run.markers.visible[4, 1]
         account = run.intake["markers"]
         assert account.rows == 14 and account.dropped["repeated"].count == 2
+        assert account.parts["A"].rows == 7 and len(account.parts["A"].dropped) == 1
         assert list(account.masked["position not finite"].numbers) == [5]
 
 
@@ -328,11 +329,14 @@ def test_endless_heap(tmp_path):
     path = foreign(tmp_path / "run.h5", arrays(), {"name": "of another program"})
     data = bytearray(path.read_bytes())
     assert jaxekf.load(path).name == "of another program"
+    # After the heap's head and the one text, which takes 16 + 24 bytes, stands what is free.
     at = data.index(b"GCOL") + 16 + 16 + 24
     assert int.from_bytes(data[at : at + 2], "little") == 0
-    data[at + 8 : at + 16] = bytes(8)
-    path.write_bytes(data)
-    assert f"heap of texts at byte {at}" in refusal(path)
+    for where, size in ((at, 0), (at - 40, 2**64 - 1)):
+        damaged = data.copy()
+        damaged[where + 8 : where + 16] = size.to_bytes(8, "little")
+        path.write_bytes(damaged)
+        assert f"heap of texts at byte {where}" in refusal(path)
 
 
 def test_nothing_is_run_or_fetched(tmp_path):

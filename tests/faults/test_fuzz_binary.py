@@ -74,7 +74,7 @@ def arrays_of(path):
             return {key: file[key] for key in file.files if "/" in key and "@" not in key}
     found = {}
     with h5py.File(path, "r") as file:
-        for label in set(file) & {"optical", "markers", "imu", "encoder"}:
+        for label in sorted(set(file) & {"optical", "markers", "imu", "encoder"}):
             for name, data in file[label].items():
                 text = h5py.check_string_dtype(data.dtype)
                 found[f"{label}/{name}"] = data.asstr()[()] if text else data[()]

@@ -321,6 +321,7 @@ def _collect(
         | {
             "recording": str(recording.path.resolve() if recording.path else recording.name),
             "inputs": inputs(recording),
+            "intake": {label: read.as_dict() for label, read in recording.intake.items()},
         },
     )
     if line.requested_ns is None or line.measured_ns is None:

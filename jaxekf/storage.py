@@ -23,6 +23,7 @@ from jaxekf.description import SCHEMA_VERSION, Source
 from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_folder
+from jaxekf.hashes import hashed
 from jaxekf.intake import without_repeats
 from jaxekf.recording import Floats, Imu, Optical, Recording, Times
 from jaxekf.rows import Intake, Reason
@@ -52,13 +53,20 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     With `sort` rows that are out of order are put in order of time.
     """
     if containers.is_container(path):
-        return containers.load(path, sort=sort)
-    folder = Path(path)
+        made = containers.load(path, sort=sort)
+        made = made.replace(sources=made.sources or hashed(path))
+    else:
+        made = _load_folder(Path(path), sort)
+    return without_repeats(made)
+
+
+def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / description.FILE
     hashes = _hashes(about, place)
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
+    sources = hashed(place)
     for label, form in _FORMS.items():
         section = about.get(label, {})
         description.check_section(place, label, section, form.described)
@@ -67,6 +75,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         if file.exists() or label in about:
             table = read_table(file, how)
             _check_hash(table, hashes)
+            sources[file.name] = table.text.sha256
             stream, account = form.read(table, Source(section, place, sort))
             read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
@@ -76,7 +85,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     info |= description.facts(info, place)
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
-    return without_repeats(Recording(name, **read, info=info, path=folder, intake=accounts))
+    return Recording(name, **read, info=info, path=folder, intake=accounts, sources=sources)
 
 
 def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:

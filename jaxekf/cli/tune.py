@@ -246,11 +246,16 @@ def tune(
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
+    _print(tuned, rows, "validation runs" if judging else "the training runs")
+
+
+def _print(tuned: tuning.Tuned, rows: list[tuning.Row], judged: str) -> None:
+    """The tables of a tuning."""
     _print_noise(tuned)
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        print_comparison(f"On {'validation runs' if judging else 'the training runs'}", rows)
+        print_comparison(f"On {judged}", rows)
 
 
 def _note(tuned: tuning.Tuned, output: Path) -> None:

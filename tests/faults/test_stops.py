@@ -141,7 +141,7 @@ def test_too_little_memory_names_the_run(three, tmp_path, monkeypatch):
     assert done.exit_code == 1
     assert "run 'run-1': got too little memory (Unable to allocate 7 TiB)" in done.output
     assert "Traceback" not in done.output
-    monkeypatch.setattr(storage, "load", lambda path: breaks())
+    monkeypatch.setattr(storage, "load", lambda path, **_: breaks())
     assert "run 'run-0': got too little memory" in call("estimate", *three).output
 
 

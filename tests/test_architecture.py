@@ -21,6 +21,7 @@ ORDER = [
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
     ("timeline", "attitude_match", "evidence"),
     ("alignment", "plausible"),
+    ("inspection",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),
     ("rules", "own_derivative"),

@@ -1,4 +1,4 @@
-"""What a recorded run holds and whether it can be used as it is: samples, gaps, clocks, frames and units."""
+"""What a recorded run holds and whether it can be used as it is: samples, gaps, clocks and units."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -25,7 +25,8 @@ _EXPECTED = ("blank", "missing tool", "status ")
 Span = tuple[float, float]
 
 
-class Gaps(NamedTuple):
+@dataclass(frozen=True)
+class Gaps:
     """Where nothing stands."""
 
     count: int

@@ -168,7 +168,7 @@ def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
 
 
 def fit(tracker: Floats, gyroscope: Floats) -> Fit:
-    """The rotation (Wahba) and ratio from the gyroscope's turns (N, 3) to the tracker's, strays left out."""
+    """Rotation (Wahba) and ratio from the gyroscope's turns (N, 3) to the tracker's, strays left out."""
     size = np.linalg.norm(tracker, axis=1)
     weight = np.minimum(1.0, np.quantile(size, 0.95) / np.maximum(size, 1e-12))
     found = _fit(tracker * weight[:, None], gyroscope * weight[:, None])

@@ -54,6 +54,7 @@ ORDER = [
         "plots.paths",
         "plots.single_markers",
         "plots.deviations",
+        "plots.timeaxis",
     ),
     ("plots",),
     ("report.saved", "report.thinning", "report.tuned"),
@@ -67,7 +68,7 @@ ORDER = [
     ("cli.comparison",),
     ("cli.simulate", "cli.estimate", "cli.report", "cli.allan", "cli.folds"),
     ("cli.plot", "cli.tune", "cli.align"),
-    ("cli.demo",),
+    ("cli.demo", "cli.check"),
     ("cli",),
     ("__main__",),
 ]

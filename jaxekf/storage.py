@@ -18,7 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import tomli_w
 
-from jaxekf import containers, description, encoder_storage, intake, marker_storage, stated
+from jaxekf import (
+    containers,
+    description,
+    encoder_storage,
+    intake,
+    marker_storage,
+    plausible,
+    stated,
+)
 from jaxekf.description import SCHEMA_VERSION, Source
 from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
@@ -51,13 +59,19 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     `description.facts`), and what is left of a stream's section as ``optical_about`` and so on. Rows that
     are not to be believed are masked and those that are none dropped: `Recording.intake` has the account.
     With `sort` rows that are out of order are put in order of time.
+
+    What streams say of each other must fit: units, order of quaternions, times that overlap
+    (`plausible.require`); ``trust_units = true`` in `recording.toml` leaves that out.
     """
     if containers.is_container(path):
         made = containers.load(path, sort=sort)
         made = made.replace(sources=made.sources or hashed(path))
     else:
         made = _load_folder(Path(path), sort)
-    return without_repeats(made)
+    made = without_repeats(made)
+    if made.info.get("trust_units") is not True:
+        plausible.require(made)
+    return made
 
 
 def _load_folder(folder: Path, sort: bool) -> Recording:

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxekf.errors import RecordingError
+from jaxekf.likeness import Integral, pairs_of, turn_between
 from jaxekf.recording import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
 _LARGEST_S = 0.5
@@ -25,6 +26,10 @@ _ROUNDS = 12
 _CORRELATED = 8
 """Samples over which residuals are taken to be correlated."""
 _LARGEST_SIGMA_S = 0.005
+_BLOCK_S, _LOCAL = 0.2, 20
+"""Seconds over which rates are compared, and blocks whose mean is taken off."""
+_BY_CHANCE = 8.0
+"""Deviations that a correlation of noise does not reach, with lag and frame fitted to it."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +95,50 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
             f"{1e3 * _LARGEST_SIGMA_S:.0f} ms or better",
             "a recording in which the tool turns about several axes, faster and slower",
         )
+    _need_changes(optical, imu, found, place)
     return found
+
+
+def _need_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
+    """Both streams tell the same changes of rate, or the latency is that of noise.
+
+    Where the rate is constant, its changes are the gyroscope's noise, in which some lag always fits best,
+    and as sharply as if they were motion. Only what the tracker shares is.
+    """
+    seen = np.flatnonzero(optical.valid)
+    t = (optical.time_ns[seen] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
+    integral = Integral(imu.time_ns, imu.gyroscope)
+    period = period_ns(optical.time_ns) / NANOSECONDS
+    span = max(_BLOCK_S, period)
+    last = float(integral.t[-1])
+    begin, end = pairs_of(t, span, last, max(1, int((t[-1] - t[0]) / span)))
+    q = optical.q_ref_body[seen]
+    lasts = (t[end] - t[begin])[:, None]
+    turned = turn_between(q[begin], q[end]) / lasts
+    said = integral.between(t[begin] - found.latency_s, t[end] - found.latency_s) / lasts
+    said = Rotation.from_rotvec(found.alignment).inv().apply(said)
+    size = np.linalg.norm(turned, axis=1)
+    kept = size <= _OUTLYING * max(float(np.quantile(size, 0.9)), 1e-12)
+    one, other = (_less_local_mean(rates[kept]) for rates in (turned, said))
+    shared = float(np.sum(one * other))
+    squares = float(np.sum(one**2) * np.sum(other**2))
+    likeness = shared / np.sqrt(squares) if squares > 0.0 else 0.0
+    if likeness * np.sqrt(one.size) < _BY_CHANCE:
+        raise RecordingError(
+            str(place),
+            "so little turning faster and slower that tracker and gyroscope are alike by chance only"
+            f" (correlation {likeness:.2f})",
+            f"{min(1.0, _BY_CHANCE / np.sqrt(max(one.size, 1))):.2f} or more",
+            "a recording in which the tool turns about several axes, faster and slower",
+        )
+
+
+def _less_local_mean(rates: Floats) -> Floats:
+    """Rates (N, 3) less the mean of those about them: no constant turning, no wandering bias."""
+    groups = np.arange(len(rates)) // _LOCAL
+    count = np.bincount(groups)[:, None]
+    total = np.stack([np.bincount(groups, rates[:, i]) for i in range(3)], axis=1)
+    return rates - (total / count)[groups]
 
 
 def _turns(optical: Optical, imu: Imu) -> _Turns:

@@ -1,4 +1,4 @@
-"""The command line: simulate, import, allan, align, estimate, tune, plot, report, demo."""
+"""The command line: simulate, import, check, allan, align, estimate, tune, plot, report, demo."""
 
 import click
 import jax
@@ -6,6 +6,7 @@ import jax
 from jaxekf import __version__
 from jaxekf.cli.align import align
 from jaxekf.cli.allan import allan
+from jaxekf.cli.check import check
 from jaxekf.cli.console import Commands
 from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
@@ -28,5 +29,5 @@ def main() -> None:
     prepare()
 
 
-for command in (simulate, import_run, allan, align, estimate, tune, plot, report, demo):
+for command in (simulate, import_run, check, allan, align, estimate, tune, plot, report, demo):
     main.add_command(command)

@@ -68,7 +68,7 @@ def align(
         "schema_version": SCHEMA_VERSION,
         "kind": "jaxekf alignment",
         "model": chosen.name,
-        "runs": [_run(run) for run in found],
+        "runs": [run_document(run) for run in found],
         "together": _together(mean),
         "calibration": parameters.to_document(chosen, params, {})["calibration"],
         "notes": [*mean.sentences(), *sentences],
@@ -89,24 +89,15 @@ def align(
 def _print(found: list[RunAlignment], mean: Together) -> None:
     rows = []
     for run in found:
-        rows.append(_row(run.run, "tracker", run.tracker))
+        rows.append(aligned_row(run.run, "tracker", run.tracker))
         if run.encoder is not None:
-            rows.append(_row(run.run, "encoder", run.encoder))
+            rows.append(aligned_row(run.run, "encoder", run.encoder))
     if len(found) > 1:
         size, axis, sigma = _turn(mean.alignment, mean.alignment_cov)
         latency = _pm(1e3 * mean.latency_s, 1e3 * mean.latency_sigma_s)
         drift = _drift(mean.drift, mean.drift_sigma)
         rows.append(["mean", "tracker", latency, drift, _pm(size, sigma), axis, ""])
-    columns = [
-        "run",
-        "stream",
-        "latency\n(ms)",
-        "drift\n(ppm)",
-        "alignment\n(deg)",
-        "about\n(x, y, z)",
-        "gyroscope bias\n(deg/s)",
-    ]
-    print_table("Against the IMU, with standard deviations", columns, rows)
+    print_table("Against the IMU, with standard deviations", alignment_columns(), rows)
     if len(found) > 1:
         click.echo(
             f"Do the runs agree? latency: chi-square {mean.latency_chi2:.1f} of {mean.runs - 1},"
@@ -115,7 +106,21 @@ def _print(found: list[RunAlignment], mean: Together) -> None:
         )
 
 
-def _row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
+def alignment_columns() -> list[str]:
+    """Heads of a table of `aligned_row`."""
+    return [
+        "run",
+        "stream",
+        "latency\n(ms)",
+        "drift\n(ppm)",
+        "alignment\n(deg)",
+        "about\n(x, y, z)",
+        "gyroscope bias\n(deg/s)",
+    ]
+
+
+def aligned_row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
+    """One stream of a run, in words."""
     size, axis, sigma = _turn(made.alignment, made.alignment_cov)
     return [
         run,
@@ -147,7 +152,8 @@ def _pm(value: float, sigma: float) -> str:
     return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
-def _run(run: RunAlignment) -> dict[str, Any]:
+def run_document(run: RunAlignment) -> dict[str, Any]:
+    """One run for JSON."""
     document: dict[str, Any] = {"run": run.run, "tracker": _aligned(run.tracker)}
     if run.encoder is not None:
         document["encoder"] = _aligned(run.encoder)

@@ -1,0 +1,190 @@
+"""`jaxekf check`: what runs hold, and whether they can be used as they are."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from jaxekf import storage
+from jaxekf.cli.align import aligned_row, alignment_columns, run_document
+from jaxekf.cli.console import json_option, note, overwrite_option, print_json, print_table
+from jaxekf.errors import RecordingError
+from jaxekf.evidence import Evidence
+from jaxekf.files import check_output, finite_or_null, whole_folder
+from jaxekf.inspection import Inspection, StreamFound, inspect
+from jaxekf.plots.style import save
+from jaxekf.plots.timeaxis import time_axis
+from jaxekf.recording import Recording
+
+STATUS = {"fine": 0, "faults": 1, "warnings": 3}
+"""Exit status by verdict; 2 is that of a command that was called wrongly."""
+
+
+class Checked(NamedTuple):
+    """A run that was looked at, or the error with which it could not be read."""
+
+    path: Path
+    recording: Recording | None
+    found: Inspection | None
+    error: str | None
+
+    @property
+    def verdict(self) -> str:
+        """``fine``, ``warnings`` or ``faults``."""
+        return "faults" if self.found is None else self.found.verdict
+
+
+@click.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="A folder for check.json and a picture of each run's time axis, check_NAME.png.",
+)
+@overwrite_option
+@json_option
+def check(runs: tuple[Path, ...], output: Path | None, overwrite: bool, as_json: bool) -> None:
+    """Samples, gaps, masked rows, clocks, frames and units of RUNS, and whether to trust them.
+
+    Gaps are steps of more than 1.5 times the median; lost is the sum of these. Clock and frame are those
+    that jaxekf align finds. Exit status: 0 where all is fine, 1 for faults (a run that cannot be read, or
+    whose streams contradict its description), 3 for warnings only.
+    """
+    if output is not None:
+        check_output(output, "check.json", overwrite=overwrite)
+    checked = [_check(path) for path in runs]
+    verdicts = {one.verdict for one in checked}
+    worst = next(v for v in ("faults", "warnings", "fine") if v in verdicts)
+    document = {"verdict": worst, "runs": [_document(one) for one in checked]}
+    if output is not None:
+        with whole_folder(output, "check.json", overwrite=overwrite) as folder:
+            text = json.dumps(finite_or_null(document), indent=2)
+            (folder / "check.json").write_text(text + "\n", "utf-8")
+            for name, one in _named(checked).items():
+                if one.recording is not None and one.found is not None:
+                    save(time_axis(one.recording, one.found), folder / f"check_{name}.png")
+        note(f"wrote {output}")
+    if as_json:
+        print_json(document)
+    for one in checked:
+        _tell(one, tables=not as_json)
+    if worst != "fine":
+        click.get_current_context().exit(STATUS[worst])
+
+
+def _check(path: Path) -> Checked:
+    try:
+        recording = storage.load(path)
+    except (RecordingError, OSError) as error:
+        return Checked(path, None, None, str(error))
+    return Checked(path, recording, inspect(recording), None)
+
+
+def _named(checked: Sequence[Checked]) -> dict[str, Checked]:
+    """By a name of its own: a second run of a name is numbered."""
+    found: dict[str, Checked] = {}
+    for one in checked:
+        name = one.path.stem if one.found is None else one.found.run
+        number = 2
+        unique = name
+        while unique in found:
+            unique, number = f"{name}-{number}", number + 1
+        found[unique] = one
+    return found
+
+
+def _document(one: Checked) -> dict[str, Any]:
+    document: dict[str, Any] = {"path": str(one.path), "verdict": one.verdict}
+    found = one.found
+    if found is None:
+        return document | {"faults": [one.error], "warnings": [], "notes": []}
+    streams = {label: told.as_dict() for label, told in found.streams.items()}
+    if found.markers:
+        singles = {name: told.as_dict() for name, told in found.markers.items()}
+        streams["markers"]["each"] = singles
+    aligned = None if found.alignment is None else run_document(found.alignment)
+    return document | {
+        "run": found.run,
+        "streams": streams,
+        "alignment": aligned,
+        "evidence": found.evidence.as_dict(),
+        "faults": list(found.faults),
+        "warnings": list(found.warnings),
+        "notes": list(found.notes),
+    }
+
+
+def _tell(one: Checked, *, tables: bool) -> None:
+    """A run's tables on standard output, and its faults on standard error, too."""
+    found = one.found
+    if found is None:
+        note(f"Error: {one.error}")
+        return
+    for text in found.faults:
+        note(f"Error: {text}")
+    if not tables:
+        return
+    streams = dict(found.streams)
+    streams |= {f"  {name}": told for name, told in found.markers.items()}
+    columns = ["stream", "samples", "usable", "rate\n(Hz)", "from\n(s)", "lasts\n(s)"]
+    columns += ["gaps", "longest\n(s)", "lost\n(s)", "hidden\n(s)", "dropped"]
+    print_table(found.run, columns, [_row(label, told) for label, told in streams.items()])
+    if found.alignment is not None:
+        made = found.alignment
+        rows = [aligned_row(made.run, "tracker", made.tracker)]
+        if made.encoder is not None:
+            rows.append(aligned_row(made.run, "encoder", made.encoder))
+        columns = alignment_columns()[1:]
+        print_table("Against the IMU, with standard deviations", columns, [r[1:] for r in rows])
+    for text in _evidence(found.evidence):
+        click.echo(f"  {text}")
+    for kind, texts in (("note", found.notes), ("warning", found.warnings)):
+        for text in texts:
+            click.echo(f"  {kind}: {text}")
+    words = {"fine": "fine", "warnings": "usable, but see the warnings", "faults": "not usable"}
+    click.echo(f"{found.run}: {words[found.verdict]}\n")
+
+
+def _row(label: str, told: StreamFound) -> list[Any]:
+    return [
+        label,
+        told.samples,
+        told.usable,
+        told.rate_hz,
+        f"{told.begin_s:.3f}",
+        told.end_s - told.begin_s,
+        told.gaps.count,
+        told.gaps.longest_s,
+        told.gaps.lost_s,
+        told.hidden.lost_s,
+        sum(told.dropped.values()),
+    ]
+
+
+def _evidence(found: Evidence) -> list[str]:
+    """What speaks for units and order."""
+    lines = []
+    if found.rate_ratio == found.rate_ratio:
+        lines.append(
+            f"rate: the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker (correlation"
+            f" {found.rate_correlation:.2f})"
+        )
+    elif found.turns:
+        lines.append("rate: too little turning, or too unlike, to tell the gyroscope's unit")
+    if found.readings:
+        others = max(made.share for made in found.readings.values())
+        lines.append(
+            f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"
+            f" another order or direction {100.0 * others:.1f} %"
+        )
+    if found.static_norm == found.static_norm:
+        lines.append(f"accelerometer: {found.static_norm:.2f} m/s^2 in the quietest seconds")
+    if found.length_ratio == found.length_ratio:
+        what = "path: the tracker moves {:.3f} times as far as the accelerometer"
+        if not found.readings:
+            what = "markers: {:.3f} times as far apart as in the geometry"
+        lines.append(what.format(found.length_ratio))
+    return lines

@@ -1,0 +1,179 @@
+"""`jaxekf check`: what it tells of good and bad runs, and how scripts know which."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from jaxekf import simulate, simulate_tool, storage
+from jaxekf.cli import main
+from jaxekf.datasets import asl, broad
+from jaxekf.inspection import find_gaps, inspect
+from jaxekf.rows import Intake, Reason
+
+LONG = os.environ.get("JAXEKF_LONG") == "1"
+
+
+def free(seed=0, duration_s=12.0, **options):
+    motion = simulate.free_motion(seed, rest_s=0.0)
+    run = simulate.recording(f"free-{seed}", motion, seed=seed, duration_s=duration_s, **options)
+    return run.replace(encoder=None)
+
+
+def late(run, seconds):
+    optical = run.need_optical()
+    return run.replace(optical=replace(optical, time_ns=optical.time_ns + round(1e9 * seconds)))
+
+
+def run_check(*arguments):
+    return CliRunner().invoke(main, ["check", *map(str, arguments)])
+
+
+def test_gaps_are_counted_as_stated():
+    """A threshold of another size, or lost seconds less the step that would have been there anyway."""
+    step = np.array([10, 10, 10, 14, 16, 10, 10, 100, 10]) * 1_000_000
+    found = find_gaps(np.concatenate([[0], np.cumsum(step)]))
+    assert (found.count, found.longest_s, found.lost_s) == (2, 0.1, 0.116)
+    assert found.spans == [(0.044, 0.06), (0.08, 0.18)]
+    assert find_gaps(np.array([5])).count == 0
+
+
+def test_verdicts_and_exit_status(tmp_path):
+    """Scripts that cannot tell good runs from bad ones, or a bad run that keeps others from being told."""
+    fine = storage.save(free(0), tmp_path / "fine")
+    warned = storage.save(late(free(1), 0.02), tmp_path / "late")
+    wrong = free(2)
+    imu = replace(wrong.imu, gyroscope=np.rad2deg(wrong.imu.gyroscope))
+    wrong = storage.save(wrong.replace(imu=imu), tmp_path / "wrong")
+    done = run_check(fine)
+    assert done.exit_code == 0, done.output
+    assert "free-0: fine" in done.stdout and "62.500" in done.stdout
+    done = run_check(fine, warned)
+    assert done.exit_code == 3
+    assert "free-1: usable, but see the warnings" in done.stdout
+    assert "ms older than stamped" in " ".join(done.stdout.split())
+    done = run_check(tmp_path / "none", wrong, fine, "--json")
+    assert done.exit_code == 1
+    document = json.loads(done.stdout)
+    assert document["verdict"] == "faults"
+    assert [run["verdict"] for run in document["runs"]] == ["faults", "faults", "fine"]
+    assert "no such folder" in document["runs"][0]["faults"][0]
+    assert 'unit = "deg/s' in document["runs"][1]["faults"][0]
+    assert all(line.startswith("Error: ") for line in done.stderr.splitlines())
+    assert len(done.stderr.splitlines()) == 2
+    good = document["runs"][2]
+    assert good["streams"]["imu"]["rate_hz"] == pytest.approx(125.0)
+    assert abs(good["alignment"]["tracker"]["latency_s"]) < 2e-3
+    assert good["evidence"]["rate_ratio"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_folder_with_pictures(tmp_path):
+    """Pictures of runs of one name that overwrite each other, a folder overwritten unasked, or a crash on
+    a run of markers or of one stream."""
+    tool = simulate_tool.tool_recording(
+        "tool",
+        simulate_tool.free_tool_motion(1),
+        seed=1,
+        duration_s=6.0,
+        hidden=[("2", 1.0, 2.0)],
+        grade=simulate_tool.ToolGrade(imu_s=0.01),
+    ).replace(encoder=None)
+    alone = free(0).replace(optical=None, name="tool")
+    paths = [storage.save(tool, tmp_path / "a"), storage.save(alone, tmp_path / "b")]
+    out = tmp_path / "checked"
+    done = run_check(*paths, "-o", out)
+    assert done.exit_code in (0, 3), done.output
+    assert sorted(f.name for f in out.iterdir()) == [
+        "check.json",
+        "check_tool-2.png",
+        "check_tool.png",
+    ]
+    document = json.loads((out / "check.json").read_text())
+    markers = document["runs"][0]["streams"]["markers"]["each"]
+    assert markers["2"]["hidden"]["lost_s"] == pytest.approx(1.0, abs=0.03)
+    assert markers["1"]["hidden"]["count"] == 0
+    assert "without tracker" in document["runs"][1]["notes"][0]
+    again = run_check(*paths, "-o", out)
+    assert again.exit_code == 1 and "a path that exists" in again.stderr
+    assert run_check(*paths, "-o", out, "--overwrite").exit_code == done.exit_code
+
+
+def test_what_is_warned_of():
+    """An occlusion that is called a fault, or a wrong row, a long gap or a run at rest that is not."""
+    run = free(0, occlusions=[(3.0, 5.0)])
+    times = run.optical.time_ns
+    hidden = Reason(np.arange(2, 4), times[2:4])
+    strange = Reason(np.arange(7, 8), times[7:8])
+    account = Intake(len(times), {"blank": hidden, "not finite": strange})
+    found = inspect(run.replace(intake={"optical": account}))
+    assert found.verdict == "warnings"
+    assert found.notes == ("optical: 2 rows are masked, blank (lines 2 to 3)",)
+    assert found.warnings == ("optical: 1 row is masked, not finite (line 7)",)
+    assert found.streams["optical"].masked == {"blank": 2, "not finite": 1}
+    assert found.streams["optical"].hidden.lost_s == pytest.approx(2.0, abs=0.03)
+    imu = run.imu
+    kept = (imu.time_ns < 6_000_000_000) | (imu.time_ns > 6_800_000_000)
+    gap = replace(imu, time_ns=imu.time_ns[kept], gyroscope=imu.gyroscope[kept])
+    assert "1 gaps of more than 0.5 s" in inspect(run.replace(imu=gap)).warnings[0]
+    still = simulate.recording("rest", simulate.Motion(), seed=0, duration_s=10.0)
+    found = inspect(still.replace(encoder=None))
+    assert found.alignment is None and "little turning" in found.warnings[0]
+
+
+GAPS = {1: (28, 3.4, 1.06), 3: (80, 15.0, 1.99), 4: (36, 2.7, 0.48)}
+
+
+@pytest.mark.parametrize("room", GAPS if LONG else [4])
+def test_gaps_and_clock_of_tum_vi(data_dir, room):
+    """Gaps of real motion capture that are missed or made up, and a clock that is off."""
+    found = inspect(asl.load(data_dir / "tumvi" / f"room{room}"))
+    count, lost, longest = GAPS[room]
+    gaps = found.streams["optical"].gaps
+    assert gaps.count == count
+    assert gaps.lost_s == pytest.approx(lost, abs=0.05)
+    assert gaps.longest_s == pytest.approx(longest, abs=0.005)
+    assert abs(found.alignment.tracker.latency_s) < 2e-3
+    assert found.faults == ()
+
+
+def broad_trials(data_dir):
+    return (
+        sorted((data_dir / "broad").glob("*.mat")) if LONG else [broad.find(data_dir / "broad", 16)]
+    )
+
+
+def test_lag_of_broad(data_dir):
+    """A lag that is not the gyroscope's of 3.5 to 5 ms in each trial."""
+    for trial in broad_trials(data_dir):
+        run = broad.load(trial).replace(encoder=None)
+        if not LONG:
+            run = first(run, 60.0)
+        found = inspect(run)
+        assert found.faults == ()
+        assert -5e-3 < found.alignment.tracker.latency_s < -3.5e-3, trial
+
+
+def first(run, seconds):
+    """The start of a run."""
+    optical, imu = run.optical, run.imu
+    end = optical.time_ns[0] + round(1e9 * seconds)
+    a, b = (int(np.searchsorted(s.time_ns, end)) for s in (optical, imu))
+    cut = {"position": optical.position[:a]}
+    optical = replace(
+        optical,
+        time_ns=optical.time_ns[:a],
+        q_ref_body=optical.q_ref_body[:a],
+        valid=optical.valid[:a],
+        **cut,
+    )
+    imu = replace(
+        imu,
+        time_ns=imu.time_ns[:b],
+        gyroscope=imu.gyroscope[:b],
+        accelerometer=imu.accelerometer[:b],
+        magnetometer=None,
+    )
+    return run.replace(optical=optical, imu=imu)

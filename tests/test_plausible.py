@@ -1,0 +1,225 @@
+"""Units, order of the quaternion, gravity and overlap: what is contradicted is named, no more."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxekf import plausible, simulate, simulate_tool
+from jaxekf.datasets import asl, broad
+from jaxekf.errors import RecordingError
+from jaxekf.pose import from_markers
+from jaxekf.recording import from_scipy, to_scipy
+
+LONG = os.environ.get("JAXEKF_LONG") == "1"
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+DEGREES = np.rad2deg(1.0)
+
+
+def tool_pose(seed, size=1.0):
+    """Poses of a moved tool, an accelerometer, and a tracked frame that lies 60 deg turned in the IMU's."""
+    motion = simulate_tool.free_tool_motion(seed)
+    motion = replace(motion, amplitude=size * motion.amplitude)
+    run = simulate_tool.tool_recording("run", motion, seed=seed, duration_s=30.0)
+    pose = from_markers(run.markers)
+    turn = Rotation.from_rotvec(np.deg2rad([20.0, 0.0, 56.0]))
+    q = from_scipy(to_scipy(pose.q_ref_body) * turn)
+    return run.replace(
+        markers=None,
+        optical=replace(pose, q_ref_body=q, position=pose.position + np.array([0.3, -0.2, -1.5])),
+    )
+
+
+def turned(run, how):
+    return run.replace(optical=replace(run.optical, q_ref_body=how(run.optical.q_ref_body)))
+
+
+def moved(run, factor):
+    return run.replace(optical=replace(run.optical, position=factor * run.optical.position))
+
+
+def scaled(run, rate=1.0, force=1.0):
+    imu = run.imu
+    force = imu.accelerometer if imu.accelerometer is None else force * imu.accelerometer
+    return run.replace(imu=replace(imu, gyroscope=rate * imu.gyroscope, accelerometer=force))
+
+
+def stated(run, quaternion):
+    return run.replace(info={**run.info, "optical_about": {"quaternion": quaternion}})
+
+
+def weightless(run):
+    """The accelerometer without gravity."""
+    q = to_scipy(run.encoder.q_ref_body)
+    force = run.imu.accelerometer + q.inv().apply(run.info["gravity_ref"])
+    return run.replace(imu=replace(run.imu, accelerometer=force))
+
+
+def apart(run):
+    return run.replace(imu=replace(run.imu, time_ns=run.imu.time_ns + 10**12))
+
+
+def rough(run, seed):
+    """200 ms off, every fiftieth pose wrong, and gaps."""
+    rng = np.random.default_rng(seed)
+    optical = run.optical
+    q, valid = optical.q_ref_body.copy(), optical.valid.copy()
+    bad = rng.choice(len(q), len(q) // 50, replace=False)
+    q[bad] = from_scipy(Rotation.random(len(bad), random_state=seed))
+    for begin in rng.choice(len(q), 5):
+        valid[begin : begin + 50] = False
+    time_ns = optical.time_ns + int(rng.choice([-1, 1])) * 200_000_000
+    return run.replace(optical=replace(optical, q_ref_body=q, valid=valid, time_ns=time_ns))
+
+
+FAULTS = {
+    "scalar last": (
+        lambda run: turned(run, lambda q: np.roll(q, -1, axis=1)),
+        'quaternion = "x,y,z,w, body to reference"',
+    ),
+    "scalar first": (
+        lambda run: stated(turned(run, lambda q: np.roll(q, 1, axis=1)), "x,y,z,w"),
+        'quaternion = "w,x,y,z, body to reference"',
+    ),
+    "conjugate": (
+        lambda run: turned(run, lambda q: q * CONJUGATE),
+        'quaternion = "w,x,y,z, reference to body"',
+    ),
+    "deg/s": (lambda run: scaled(run, rate=DEGREES), r'57\..*unit = "deg/s, m/s\^2"'),
+    "rad/s": (lambda run: scaled(run, rate=1 / DEGREES), r'0\.017.*unit = "rad/s, m/s\^2"'),
+    "mm": (lambda run: moved(run, 1e3), r'\d{3,4}(\.\d)? times as far .*unit = "1, mm"'),
+    "m": (lambda run: moved(run, 1e-3), r'0\.00\d+ times as far.*unit = "1, m"'),
+    "g": (lambda run: scaled(run, force=1 / 9.80665), 'unit = "rad/s, g"'),
+    "not g": (lambda run: scaled(run, force=9.80665), r'unit = "rad/s, m/s\^2"'),
+    "deg/s and g": (lambda run: scaled(run, DEGREES, 1 / 9.80665), 'unit = "deg/s, g"'),
+    "no gravity": (weightless, "gravity is removed"),
+    "apart": (apart, r"optical from .* to .* imu from 1000\.000 to 1030\.000 s.*overlap"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_contradicted_is_named(fault):
+    """A wrong unit, order or direction that is taken as it stands, or another entry named for it; also
+    where the clocks are 200 ms apart and poses are wrong."""
+    make, message = FAULTS[fault]
+    for seed in range(6 if LONG else 2):
+        run = tool_pose(seed)
+        plausible.require(run)
+        plausible.require(rough(run, seed))
+        for wrong in (make(run), make(rough(run, seed))):
+            with pytest.raises(RecordingError, match=message):
+                plausible.require(wrong)
+
+
+def test_the_likelier_reading_is_named_first():
+    """Of order and direction, which turns alone do not part, the one that turns axes for nothing."""
+    run = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=30.0)
+    plausible.require(run)
+    for fault in ("scalar last", "scalar first", "conjugate"):
+        make, message = FAULTS[fault]
+        with pytest.raises(RecordingError, match=r"\[optical\] " + message + " or quaternion"):
+            plausible.require(make(run))
+
+
+def test_markers_in_millimetres():
+    """A geometry that is called another tool's where only the unit is another."""
+    motion = simulate_tool.free_tool_motion(1)
+    run = simulate_tool.tool_recording("run", motion, seed=1, duration_s=10.0)
+    plausible.require(run)
+    found = plausible.evidence(run)
+    assert found.explained > 0.95 and 0.95 < found.rate_ratio < 1.05
+    for factor, message in ((1e3, r'1000 times.*\[markers\] unit = "mm"'), (1e-3, "geometry")):
+        markers = replace(run.markers, position=factor * run.markers.position)
+        with pytest.raises(RecordingError, match=message):
+            plausible.require(run.replace(markers=markers))
+    with pytest.raises(RecordingError, match=r'57.*"deg/s, m/s'):
+        plausible.require(scaled(run, rate=DEGREES))
+
+
+def test_the_file_and_entry_are_named(tmp_path):
+    """An error that does not say where to mend it."""
+    run = FAULTS["deg/s"][0](tool_pose(0))
+    (tmp_path / "recording.toml").write_text("schema_version = 1\n")
+    with pytest.raises(RecordingError, match=r"recording.toml:imu\.unit: got") as caught:
+        plausible.require(run.replace(path=tmp_path))
+    assert caught.value.column == "imu.unit"
+
+
+def weak_motions():
+    """What tells little or nothing: rest, slow and constant turns, turns about one axis."""
+    yield simulate.Motion()
+    yield simulate.Motion(rate=(0.01, 0.0, -0.02))
+    yield simulate.constant_rate_motion(rest_s=5.0)
+    yield simulate.free_motion(3, speed_deg=2.0)
+    one = simulate.free_motion(4)
+    yield replace(one, amplitude=one.amplitude * np.array([[1.0], [0.0], [0.0]]))
+
+
+@pytest.mark.parametrize("seed", range(20 if LONG else 2))
+def test_no_false_alarm_of_weak_motion(seed):
+    """An alarm where nothing is told, or an answer made up from noise."""
+    rng = np.random.default_rng(seed)
+    for motion in weak_motions():
+        grade = simulate.SensorGrade(
+            gyroscope_deg=10 ** rng.uniform(-2, 0),
+            bias_deg=3.0,
+            optical_deg=10 ** rng.uniform(-2, 0),
+        )
+        run = simulate.recording("run", motion, seed=seed, duration_s=20.0, grade=grade)
+        plausible.require(run)
+        plausible.require(rough(run, seed))
+    rest = simulate.recording("run", simulate.Motion(), seed=seed, duration_s=20.0)
+    assert np.isnan(plausible.evidence(rest).rate_ratio)
+    plausible.require(tool_pose(seed, size=0.0))
+
+
+def test_one_axis_does_not_tell_the_order():
+    """An order made up where turns about one axis fit every reading."""
+    run = simulate.recording("run", simulate.constant_rate_motion(), seed=0, duration_s=30.0)
+    plausible.require(turned(run, lambda q: q * CONJUGATE))
+    assert plausible.evidence(run).second_axis < 0.05
+
+
+def test_what_is_missing_is_not_judged():
+    """A crash on a run without IMU, tracker, position or accelerometer, or of a few samples."""
+    run = tool_pose(0)
+    bare = replace(run.optical, position=None)
+    force = replace(run.imu, accelerometer=None)
+    hidden = replace(run.optical, valid=np.zeros(len(run.optical.time_ns), bool))
+    for less in (
+        run.replace(imu=None),
+        run.replace(optical=None),
+        run.replace(optical=bare),
+        run.replace(imu=force),
+        run.replace(optical=hidden),
+        run.replace(imu=replace(force, time_ns=force.time_ns[:1], gyroscope=force.gyroscope[:1])),
+    ):
+        plausible.require(less)
+        assert plausible.evidence(less).as_dict()["explained"] is not None
+
+
+def real_runs(data_dir):
+    trials = sorted((data_dir / "broad").glob("*.mat"))
+    rooms = [data_dir / "tumvi" / f"room{i}" for i in (1, 3, 4)]
+    chosen = (trials, rooms) if LONG else ([broad.find(data_dir / "broad", 7)], rooms[2:])
+    for i, trial in enumerate(chosen[0]):
+        run = broad.load(trial)
+        yield run
+        yield broad.degrade(run, seed=0, trial=i)
+    yield from (asl.load(room) for room in chosen[1])
+
+
+def test_real_runs(data_dir):
+    """False alarms on real recordings, or a wrong order in them that passes."""
+    for i, run in enumerate(real_runs(data_dir)):
+        found = plausible.evidence(run)
+        plausible.check(run, found)
+        assert found.explained > 0.95 and abs(found.rate_ratio - 1.0) < 0.01
+        assert abs(found.static_norm - 9.81) < 0.15
+        plausible.require(rough(run, i))
+        for fault in ("scalar last", "scalar first", "conjugate", "deg/s", "rad/s", "g", "mm", "m"):
+            make, message = FAULTS[fault]
+            with pytest.raises(RecordingError, match=message):
+                plausible.require(make(run))

@@ -215,11 +215,8 @@ def _hdf5_stored(path: Path, key: str, data: Any) -> Stored:
     if data.chunks:
         chunk = Stored(data.dtype, data.chunks, data.__getitem__)
         check_sizes(path, {key: chunk})
+    _refuse_objects(place, data.dtype)
     text = h5py.check_string_dtype(data.dtype) is not None
-    if data.dtype.hasobject and not text:
-        raise RecordingError(
-            place, "a type of references or lists", "numbers, flags or texts", "exporting it again"
-        )
     return Stored(
         data.dtype, data.shape, lambda: np.asarray(data.asstr()[()] if text else data[()])
     )
@@ -227,8 +224,19 @@ def _hdf5_stored(path: Path, key: str, data: Any) -> Stored:
 
 def _attribute(path: Path, node: Any, name: str, key: str = "") -> Any:
     found = node.attrs.get_id(name)
+    place = f"{path}:{key}@{name}"
+    _refuse_objects(place, found.dtype)
     stored = Stored(found.dtype, found.shape, lambda: np.asarray(node.attrs[name]))
     return _text(path, f"{key}@{name}", stored)
+
+
+def _refuse_objects(place: str, dtype: np.dtype) -> None:
+    """Only texts may be of any length: the HDF5 library itself crashes on some other types in a damaged
+    file."""
+    if dtype.hasobject and h5py.check_string_dtype(dtype) is None:
+        raise RecordingError(
+            place, "a type of references or lists", "numbers, flags or texts", "exporting it again"
+        )
 
 
 def _text(path: Path, key: str, stored: Stored) -> Any:

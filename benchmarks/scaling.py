@@ -269,6 +269,8 @@ def draw(found: list[Point], slopes: dict[str, float], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    from jaxekf.files import whole_file
+
     labels = {
         "run length": "steps in one run",
         "runs": "runs of 500 steps",
@@ -293,7 +295,8 @@ def draw(found: list[Point], slopes: dict[str, float], path: Path) -> None:
     axes[0, 0].set_ylabel("time of one call (ms)")
     axes[1, 0].set_ylabel("peak memory above the start, with compiler (MiB)")
     figure.suptitle("10-state model unless said; one CPU device, float64; fitted past the knee")
-    figure.savefig(path, dpi=120)
+    with whole_file(path, overwrite=True) as made:
+        figure.savefig(made, dpi=120)
 
 
 if __name__ == "__main__":

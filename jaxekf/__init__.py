@@ -11,13 +11,16 @@ from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batc
 from jaxekf.errors import (
     FilterError,
     JaxekfError,
+    MissingPackageError,
     ModelError,
     PrecisionError,
     RecordingError,
+    ResourceError,
     TuningError,
 )
 from jaxekf.estimation import estimate, estimate_many
 from jaxekf.export import read_export
+from jaxekf.gaps import split_at_gaps
 from jaxekf.interpolation import InputSample
 from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
 from jaxekf.kernels import jit
@@ -60,6 +63,7 @@ __all__ = [
     "Known",
     "Manifold",
     "Markers",
+    "MissingPackageError",
     "Model",
     "ModelError",
     "Optical",
@@ -69,6 +73,7 @@ __all__ = [
     "PrecisionError",
     "Recording",
     "RecordingError",
+    "ResourceError",
     "Samples",
     "Score",
     "Sensor",
@@ -105,5 +110,6 @@ __all__ = [
     "save",
     "save_parameters",
     "score",
+    "split_at_gaps",
     "timeline",
 ]

@@ -2,10 +2,10 @@
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         )
     try:
         about = tomllib.loads(file.read_text("utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError, OSError) as error:
         raise RecordingError(
             file, f"text that is not TOML ({error})", "TOML", "mending it"
         ) from error
@@ -45,13 +45,26 @@ def read_description(folder: Path) -> dict[str, Any]:
     return about
 
 
+class Source(NamedTuple):
+    """What is said of a stream, and how it is to be read."""
+
+    about: Mapping[str, Any]
+    """Its section of `recording.toml`."""
+    place: Path
+    """That file."""
+    sort: bool
+    """Whether rows that are out of order are sorted."""
+
+
 def check_section(file: Path, label: str, section: Any, known: Mapping[str, str]) -> None:
-    """What is said of a stream is what this version reads: nothing is taken for another."""
+    """What is said of a stream's kind and frame is what this version reads, not taken for it."""
     if not isinstance(section, dict):
         raise RecordingError(
             file, f"{label} = {section!r}", "a section", f"[{label}]", column=label
         )
     for key, expected in known.items():
+        if key in ("unit", "quaternion"):
+            continue  # `stated` reads these.
         if key in section and section[key] != expected:
             raise RecordingError(
                 file,
@@ -102,6 +115,31 @@ def unit_vector(value: Any, size: int, place: Path | str, key: str) -> Floats:
     vector = nonzero_vector(value, size, place, key)
     length = np.linalg.norm(vector)
     return vector if abs(length - 1.0) < 1e-15 else vector / length
+
+
+def words(
+    about: Mapping[str, Any], label: str, key: str, default: Sequence[str], place: Path | str
+) -> Sequence[str]:
+    """A word or a list of words or numbers."""
+    value = about.get(key, list(default))
+    value = value if isinstance(value, list) else [value]
+    if not all(isinstance(word, str | int | float) for word in value) or not value:
+        name = f"{label}.{key}"
+        raise RecordingError(place, f"{name} = {value!r}", "words", f'{key} = ["ok"]', column=name)
+    return [str(word) for word in value]
+
+
+def limit(about: Mapping[str, Any], label: str, key: str, place: Path | str) -> float:
+    """A positive number that something may not exceed; infinite where none is stated."""
+    if key not in about:
+        return math.inf
+    value = finite_number(about[key], place, f"{label}.{key}")
+    if value <= 0.0:
+        name = f"{label}.{key}"
+        raise RecordingError(
+            place, f"{name} = {value!r}", "a positive number", _MENDING, column=name
+        )
+    return value
 
 
 def latency_ns(about: Mapping[str, Any], label: str, place: Path | str) -> int:

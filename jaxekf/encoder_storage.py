@@ -7,15 +7,17 @@ lies in the tracker's (`q_optical_encoder`, `p_optical_encoder`).
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxekf import description
+from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Encoder, Floats, from_scipy, to_scipy, unit_quaternions
+from jaxekf.recording import Encoder, Floats, from_scipy, to_scipy
+from jaxekf.rows import Intake
 from jaxekf.tables import (
     POSITION,
     QUATERNION,
@@ -25,7 +27,7 @@ from jaxekf.tables import (
     flags,
     need_columns,
     numbers,
-    read_times,
+    stamps,
     whole_or_blank,
 )
 
@@ -33,7 +35,7 @@ DESCRIBED = {"quaternion": description.BODY_TO_REFERENCE}
 LAYOUTS = ("time,angle[,scored]", "time,qw,qx,qy,qz[,x,y,z][,scored]")
 
 
-def read(table: Table, about: Mapping[str, Any]) -> Encoder:
+def read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     """Attitude of the tool from a joint angle or a quaternion, in the tracker's frame.
 
     With an angle: ``q = q_zero exp(axis angle)`` where the axis is fixed in the body
@@ -42,20 +44,29 @@ def read(table: Table, about: Mapping[str, Any]) -> Encoder:
     its origin there, in metres. A blank position is NaN.
     """
     need_columns(table, *LAYOUTS)
-    place = table.path.with_name(description.FILE)
+    about, place = source.about, source.place
     scored, position = flags(table, "scored"), None
     frame = _fixed_rotation(about, "q_optical_encoder", place)
     if "angle" in table.columns:
-        q = joint_attitude(finite_numbers(table, ("angle",))[:, 0], about, place)
-        valid = np.ones(len(q), bool)
+        (scale,) = stated.factors("joint", about, place)
+        length = 1.0
+        q = joint_attitude(scale * finite_numbers(table, ("angle",))[:, 0], about, place)
     else:
-        q, valid = unit_quaternions(numbers(table, QUATERNION, blank=True))
+        _, length = stated.factors("encoder", about, place)
+        turning = stated.turning("encoder", about, place)
+        q = turning.standard(numbers(table, turning.columns(table.columns), blank=True))
     if set(POSITION) <= set(table.columns):
         origin = about.get("p_optical_encoder", [0.0, 0.0, 0.0])
         origin = description.finite_vector(origin, 3, place, "encoder.p_optical_encoder")
-        position = frame.apply(whole_or_blank(table, POSITION)) + origin
-    q = from_scipy(frame * to_scipy(q))
-    return Encoder(read_times(table), q, valid, scored & valid, position)
+        position = frame.apply(length * whole_or_blank(table, POSITION)) + origin
+    stream, account = intake.encoder(
+        table.place, stamps(table), q, position, scored=scored, sort=source.sort
+    )
+    if "q_optical_encoder" not in about:
+        # Not even turned by nothing, which would round it.
+        return stream, account
+    q = from_scipy(frame * to_scipy(stream.q_ref_body))
+    return replace(stream, q_ref_body=q), account
 
 
 def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -> Floats:

@@ -22,7 +22,9 @@ class RecordingError(JaxekfError):
     ) -> None:
         self.path, self.line, self.column = Path(path), line, column
         place = ":".join(str(part) for part in (path, line, column) if part is not None)
-        super().__init__(f"{place}: got {got}, expected {expected}; try {hint}")
+        told = f"{place}: got {got}, expected {expected}; try {hint}"
+        # Names and texts of a damaged file may hold anything: the message is one line that can be printed.
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in told))
 
 
 class ModelError(JaxekfError):
@@ -39,3 +41,11 @@ class FilterError(JaxekfError):
 
 class TuningError(JaxekfError):
     """A tuning problem is ill-posed or could not be started."""
+
+
+class ResourceError(JaxekfError):
+    """There is too little memory for what was asked; the message names the run."""
+
+
+class MissingPackageError(JaxekfError):
+    """What was asked needs a package that is not installed; the message says how to install it."""

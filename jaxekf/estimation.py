@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import ekf, manifold, padding, parameters, smoother, storage, timeline
+from jaxekf import ekf, manifold, memory, padding, parameters, smoother, storage, timeline
 from jaxekf.ekf import FilterOutput
 from jaxekf.errors import FilterError, PrecisionError
+from jaxekf.hashes import inputs
 from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters
 from jaxekf.models import adapted, get_model
@@ -55,7 +56,8 @@ def estimate(
     nanoseconds on the recording's clock, or `jaxekf.every`; the estimate at these is `Estimate.requested`.
 
     Raises `RecordingError` for what is wrong with the data or where nothing of `at` lies within the run,
-    `FilterError` where the recursion broke, `PrecisionError` in float32.
+    `FilterError` where the recursion broke, `ResourceError` where memory is too small for it,
+    `PrecisionError` in float32.
     """
     return estimate_many([run], model, params, smooth=smooth, at=at if at is None else [at])[0]
 
@@ -136,7 +138,9 @@ def filter_timelines(
             index = np.minimum(np.arange(start, start + size), len(members) - 1)
             given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (stacked, steps))
             devices = sharing_devices()
-            found = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
+            names = [lines[i].name for i in members[start : start + size]]
+            with memory.for_runs(names):
+                found = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
             for place in range(min(size, len(members) - start)):
                 one = jax.tree.map(lambda a, place=place: a[place], found)
                 _check(model, lines[members[start + place]], one[0])
@@ -314,7 +318,11 @@ def _collect(
         smoothed=smooth,
         # Absolute, so that it is found again from another working folder.
         provenance=provenance()
-        | {"recording": str(recording.path.resolve() if recording.path else recording.name)},
+        | {
+            "recording": str(recording.path.resolve() if recording.path else recording.name),
+            "inputs": inputs(recording),
+            "intake": {label: read.as_dict() for label, read in recording.intake.items()},
+        },
     )
     if line.requested_ns is None or line.measured_ns is None:
         return made

@@ -10,8 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from jaxekf.recording import Encoder, Flags, Floats, Imu, Optical, Times
+from jaxekf.recording import Encoder, Flags, Floats, Imu, Optical, Recording, Times
 from jaxekf.rows import Indices, Intake, Place, Reason
 
 MOST_BAD_NORMS = 0.05
@@ -19,6 +20,8 @@ MOST_BAD_NORMS = 0.05
 NORM_ROUNDED, NORM_WRONG = 1e-3, 0.1
 SLOWEST_S = 0.5
 """Median step from which on a stream is taken for one whose times are in another unit."""
+_RESTING = 0.05
+"""rad/s: what a gyroscope of a resting tool tells at most, its bias included."""
 STATUS_OK = ("ok", "0")
 """Words of a status that mean a good sample, unless others are stated; in lower case."""
 NDI_STATUS = {
@@ -38,27 +41,31 @@ def optical(
     quaternion: Floats,
     position: Floats | None = None,
     *,
-    status: Sequence[str] | None = None,
+    status: Sequence[str] | NDArray[np.str_] | None = None,
     status_ok: Sequence[str] = STATUS_OK,
     error: Floats | None = None,
     error_max: float = np.inf,
+    hidden: Flags | None = None,
+    also: Mapping[str, Flags] | None = None,
     sort: bool = False,
     **said: Any,
 ) -> tuple[Optical, Intake]:
     """A tracker's poses (w, x, y, z, body to reference; metres; NaN where blank), bad rows masked.
 
     `status` (N,) are words of which `status_ok` (any case) mean a good row; rows whose reported fit
-    `error` (N,), metres, exceeds `error_max` are masked. `said` are further fields of `Optical`. Raises
-    `RecordingError` where no row is usable, and what `in_order`, `check_rate` and `judge_quaternions` do.
+    `error` (N,), metres, exceeds `error_max` are masked, as are those that `hidden` (N,) names, and those
+    (N,) that an importer knows to be bad, for the reasons `also`. `said` are further fields of `Optical`.
+    Raises `RecordingError` where no row is usable, and what `in_order`, `check_rate` and
+    `judge_quaternions` do.
     """
-    numbers = [a for a in (quaternion, position, error) if a is not None]
+    numbers = [a for a in (quaternion, position, error, hidden) if a is not None]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
     quaternion = quaternion[order]
     position = None if position is None else position[order]
     error = None if error is None else error[order]
-    reasons: dict[str, Flags] = {}
+    reasons: dict[str, Flags] = {} if hidden is None else {"hidden": hidden[order]}
     if status is not None:
         words = np.array([str(status[i]).strip().lower() for i in order], str)
         good = {str(word).strip().lower() for word in status_ok}
@@ -67,11 +74,12 @@ def optical(
                 meaning = NDI_STATUS.get(word)
                 name = f"status {word}" if meaning is None else f"status {word} ({meaning})"
                 reasons[name] = words == word
+    reasons |= {name: bad[order] for name, bad in (also or {}).items()}
     # Only what is said to be good is judged as a quaternion; the rest may hold anything.
-    hidden = np.zeros(len(time_ns), bool)
+    ignored = np.zeros(len(time_ns), bool)
     for bad in reasons.values():
-        hidden |= bad
-    unit, lost, notes = judge_quaternions(place, np.where(hidden[:, None], np.nan, quaternion))
+        ignored |= bad
+    unit, lost, notes = judge_quaternions(place, np.where(ignored[:, None], np.nan, quaternion))
     reasons |= lost
     if position is not None:
         reasons["position not finite"] = ~np.isfinite(position).all(axis=1)
@@ -122,6 +130,8 @@ def imu(
     streams = [None if a is None else a[chosen] for a in (gyroscope, accelerometer, magnetometer)]
     gyro, *others = streams
     assert gyro is not None
+    assert account.numbers is not None
+    account = replace(account, numbers=account.numbers[valid])
     return Imu(time_ns[valid], gyro, *others), account
 
 
@@ -132,28 +142,42 @@ def encoder(
     position: Floats | None = None,
     *,
     scored: Flags | None = None,
+    hidden: Flags | None = None,
     sort: bool = False,
 ) -> tuple[Encoder, Intake]:
-    """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked.
+    """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked, as are
+    rows that `hidden` (N,) names.
 
-    A position that is not known is NaN. Raises what `in_order`, `check_rate` and `judge_quaternions` raise.
+    A position that is not known is NaN. Raises what `in_order` and `judge_quaternions` raise.
     """
     scored = np.ones(len(time_ns), bool) if scored is None else scored
-    numbers = [quaternion, scored.astype(float)]
+    hidden = np.zeros(len(time_ns), bool) if hidden is None else hidden
+    numbers = [quaternion, scored, hidden]
     numbers += [] if position is None else [position]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
-    unit, lost, notes = judge_quaternions(place, quaternion[order])
-    valid, account = mask_first(place, time_ns, account, lost)
+    hidden = hidden[order]
+    seen = np.where(hidden[:, None], np.nan, quaternion[order])
+    unit, lost, notes = judge_quaternions(place, seen)
+    valid, account = mask_first(place, time_ns, account, {"hidden": hidden} | lost)
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
     return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
 
 
 def in_order(
-    place: Place, time_ns: Times, data: Sequence[Floats], *, sort: bool = False
+    place: Place,
+    time_ns: Times,
+    data: Sequence[Floats | Flags],
+    *,
+    sort: bool = False,
+    part: Indices | None = None,
+    parts: Sequence[str] = (),
 ) -> tuple[Indices, Intake]:
     """Rows in order of time, each time once, and what was dropped.
+
+    With `part` (N,), such as the marker that each row is of, it is each part that has each time once;
+    `parts` are their names.
 
     A row with the time and all numbers of the one before is dropped. Raises `RecordingError` for one of the
     same time with other numbers, and for time that runs backwards, unless `sort` puts it right.
@@ -166,7 +190,7 @@ def in_order(
             at,
             "time",
             f"{_seconds(time_ns[at])} s after {_seconds(time_ns[at - 1])} s",
-            "times that increase",
+            "times that increase" if part is None else "times that do not decrease",
             "splitting logs that were put together, or --sort to order the rows by time",
         )
     if early.size:
@@ -174,18 +198,19 @@ def in_order(
         order = np.argsort(time_ns, kind="stable")
         notes = (f"{late} rows were out of order and are sorted by time",)
     time = time_ns[order]
-    again = np.flatnonzero(np.diff(time) == 0) + 1
+    before, again = _repeats(time, None if part is None else part[order])
     if again.size:
         flat = np.concatenate([np.reshape(d, (len(time_ns), -1)) for d in data], axis=1)[order]
-        one, other = flat[again], flat[again - 1]
+        one, other = flat[again], flat[before]
         same = ((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1)
         if not same.all():
             at = int(order[again[np.argmin(same)]])
+            named = "" if part is None else f"'{parts[part[at]]}' at "
             raise place.error(
                 at,
                 "time",
-                f"{_seconds(time_ns[at])} s twice with other numbers",
-                "each time once",
+                f"{named}{_seconds(time_ns[at])} s twice with other numbers",
+                "each time once" if part is None else "each of them once a frame",
                 "exporting times with more digits, or removing one of the rows",
             )
     kept = np.ones(len(time), bool)
@@ -193,12 +218,25 @@ def in_order(
     dropped = {}
     if again.size:
         dropped["repeated"] = reasoned(place, order[again], time[again])
-    return order[kept], Intake(len(time_ns), {}, dropped, notes, place.unit)
+    kept = order[kept]
+    numbers = kept if place.numbers is None else place.numbers[kept]
+    return kept, Intake(len(time_ns), {}, dropped, notes, place.unit, numbers)
+
+
+def _repeats(time_ns: Times, part: Indices | None) -> tuple[Indices, Indices]:
+    """Rows with the time (and part) of an earlier one: the one before each, and they themselves."""
+    if part is None:
+        again = np.flatnonzero(np.diff(time_ns) == 0) + 1
+        return again - 1, again
+    order = np.lexsort((part, time_ns))
+    same = (np.diff(time_ns[order]) == 0) & (np.diff(part[order]) == 0)
+    at = np.flatnonzero(same)
+    return order[at], order[at + 1]
 
 
 def reasoned(place: Place, rows: Indices, time_ns: Times) -> Reason:
     """The reason of rows (n,) of a place, which have these stamps."""
-    numbers = np.array([place.number(row) for row in rows], np.intp)
+    numbers = rows if place.numbers is None else place.numbers[rows]
     order = np.argsort(numbers, kind="stable")
     return Reason(numbers[order], time_ns[order])
 
@@ -291,3 +329,73 @@ def check_rate(place: Place, time_ns: Times) -> None:
 
 def _seconds(time_ns: int) -> str:
     return f"{int(time_ns) / 1e9:.9f}".rstrip("0").rstrip(".")
+
+
+def without_repeats(recording: Recording) -> Recording:
+    """A run in which poses that a tracker repeats to the last bit are masked: so looks a lost tool.
+
+    Where the gyroscope turns meanwhile the pose is frozen, and masked whatever the status says; where it
+    rests a tracker that rounds may repeat itself, and is believed. Without an IMU or a status to tell,
+    repeats are masked as suspicious, and so is the identity at the origin from its first row on.
+    """
+    stream, account = recording.optical, recording.intake.get("optical")
+    if stream is None or account is None:
+        return recording
+    seen = np.flatnonzero(stream.valid)
+    pose = stream.q_ref_body[seen]
+    if stream.position is not None:
+        pose = np.concatenate([pose, stream.position[seen]], axis=1)
+    again = (pose[1:] == pose[:-1]).all(axis=1)
+    if not again.any():
+        return recording
+    # From the first to the last row of one pose.
+    first = np.maximum.accumulate(
+        np.where(np.concatenate([[True], ~again]), np.arange(len(seen)), 0)
+    )
+    repeated = np.concatenate([[False], again])
+    moves, told = np.zeros(len(seen), bool), recording.imu is not None
+    if recording.imu is not None:
+        begin = stream.time_ns[seen[first]] - stream.latency_ns
+        end = stream.time_ns[seen] - stream.latency_ns
+        moves = _turns(recording.imu, begin, end)
+    home = np.zeros(pose.shape[1])
+    home[0] = 1.0
+    lost = (pose == home).all(axis=1) & (stream.position is not None)
+    lost &= repeated | np.concatenate([again, [False]])
+    names = {
+        "frozen while the IMU moves": repeated & moves,
+        "suspicious (identity at the origin, repeated)": lost & (not told),
+        "suspicious (pose repeated exactly)": repeated & (not told),
+    }
+    if told:
+        # The first row of such a pose is no better than those that follow.
+        gone = np.zeros(len(seen), bool)
+        gone[first[lost & repeated & moves]] = True
+        names["frozen while the IMU moves"] |= gone
+    place = Place(recording.path or recording.name, account.numbers)
+    bad = np.zeros(len(seen), bool)
+    for name, which in names.items():
+        rows = seen[which & ~bad]
+        bad |= which
+        if rows.size:
+            account = account.with_masked(name, reasoned(place, rows, stream.time_ns[rows]))
+    if not bad.any():
+        return recording
+    valid = stream.valid.copy()
+    valid[seen[bad]] = False
+    if not valid.any():
+        raise place.error(
+            None, None, "one pose in all rows", "a tool that moves", "a run in which it is seen"
+        )
+    return recording.replace(
+        optical=replace(stream, valid=valid), intake={**recording.intake, "optical": account}
+    )
+
+
+def _turns(imu: Imu, begin: Times, end: Times) -> Flags:
+    """Whether the gyroscope tells a turn from one time to another (N,): whatever its bias."""
+    low = np.clip(np.searchsorted(imu.time_ns, begin), 0, len(imu.time_ns) - 1)
+    high = np.clip(np.searchsorted(imu.time_ns, end, side="right"), low + 1, len(imu.time_ns))
+    rate = np.linalg.norm(imu.gyroscope, axis=1)
+    total = np.concatenate([[0.0], np.cumsum(rate)])
+    return (total[high] - total[low]) / (high - low) > _RESTING

@@ -9,24 +9,26 @@ has no line, is hidden. The section ``[markers]`` holds `latency` (s), `quality_
 
 import json
 import re
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxekf import description
+from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Floats, Markers
+from jaxekf.recording import Floats, Markers, Times
+from jaxekf.rows import Intake, Part, Place
 from jaxekf.tables import (
     POSITION,
     Sheet,
     Table,
     need_columns,
-    read_times,
     reported,
+    stamps,
     whole_or_blank,
+    words,
 )
 
 DESCRIBED = {"kind": "markers", "unit": "m"}
@@ -35,7 +37,7 @@ LAYOUT = "time,marker,x,y,z[,quality][,error]"
 Indices = NDArray[np.intp]
 
 
-def read(table: Table, about: Mapping[str, Any]) -> Markers:
+def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     """The frames of `markers.csv`, markers in the order of the geometry.
 
     Hidden markers are NaN, as are qualities and errors that were not reported. Raises
@@ -43,34 +45,61 @@ def read(table: Table, about: Mapping[str, Any]) -> Markers:
     decrease, and for what is not a finite number.
     """
     need_columns(table, LAYOUT)
-    place = table.path.with_name(description.FILE)
+    about, place = source.about, source.place
+    (length,) = stated.factors("markers", about, place)
     names, p_body_marker = _geometry(about.get("geometry"), place)
-    times = read_times(table, repeated=True)
+    position, error = length * whole_or_blank(table, POSITION), reported(table, "error", least=0.0)
+    error = None if error is None else length * error
+    quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
+    columns = [a for a in (position, quality, error) if a is not None]
+    order, account = intake.in_order(
+        table.place, stamps(table), columns, sort=source.sort, part=marker, parts=names
+    )
+    all_marker, times, marker = marker, stamps(table)[order], marker[order]
+    intake.check_rate(table.place, np.unique(times))
     first = np.concatenate([[True], np.diff(times) > 0])
-    frame, marker = np.cumsum(first) - 1, _marker_of_each_line(table, names)
-    _check_once_a_frame(table, frame, marker)
+    frame = np.cumsum(first) - 1
 
     def by_frame(lines: Floats | None) -> Any:
         if lines is None:
             return None
         spread = np.full((frame[-1] + 1, len(names), *lines.shape[1:]), np.nan)
-        spread[frame, marker] = lines
+        spread[frame, marker] = lines[order]
         return spread
 
-    position = by_frame(whole_or_blank(table, POSITION))
-    return Markers(
+    place_of_kept = table.place.take(order)
+    lines = np.bincount(all_marker, minlength=len(names))
+    there = np.zeros((frame[-1] + 1, len(names)), bool)
+    there[frame, marker] = True
+    gone = np.setdiff1d(np.arange(len(all_marker)), order)
+    parts = {
+        name: Part(
+            int(lines[m]), stamps(table)[gone[all_marker[gone] == m]], times[first][~there[:, m]]
+        )
+        for m, name in enumerate(names)
+    }
+    account = replace(_account(place_of_kept, times, position[order], account), parts=parts)
+    position = by_frame(position)
+    stream = Markers(
         times[first],
         position,
         np.isfinite(position).all(axis=2),
         names,
         p_body_marker,
-        quality=by_frame(reported(table, "quality")),
+        quality=by_frame(quality),
         quality_min=description.finite_number(
             about.get("quality_min", 0.0), place, "markers.quality_min"
         ),
-        error=by_frame(reported(table, "error", least=0.0)),
+        error=by_frame(error),
         latency_ns=description.latency_ns(about, "markers", place),
     )
+    return stream, account
+
+
+def _account(place: Place, times: Times, position: Floats, account: Intake) -> Intake:
+    """With the lines of hidden markers masked."""
+    _, account = intake.mask_first(place, times, account, {"blank": np.isnan(position).all(axis=1)})
+    return account
 
 
 def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
@@ -138,13 +167,14 @@ def _check_names(names: tuple[str, ...], place: Path | str) -> None:
 
 def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
     """Index (N,) into `names` of the marker that each line is of."""
-    at, index = table.columns.index("marker"), {name: i for i, name in enumerate(names)}
-    cells = [row[at].strip() for row in table.rows]
-    marker = np.array([index.get(cell, -1) for cell in cells], np.intp)
+    index = {name: i for i, name in enumerate(names)}
+    cells = words(table, "marker")
+    kinds, which = np.unique(cells, return_inverse=True)
+    marker = np.array([index.get(str(kind), -1) for kind in kinds], np.intp)[which]
     unknown = np.flatnonzero(marker < 0)
     if unknown.size:
         row = int(unknown[0])
-        name = cells[row]
+        name = str(cells[row])
         key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
         raise RecordingError(
             table.path,
@@ -157,19 +187,3 @@ def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
             column="marker",
         )
     return marker
-
-
-def _check_once_a_frame(table: Table, frame: Indices, marker: Indices) -> None:
-    place_in_frames = frame * (marker.max() + 1) + marker
-    _, first = np.unique(place_in_frames, return_index=True)
-    if len(first) < len(marker):
-        row = int(np.setdiff1d(np.arange(len(marker)), first)[0])
-        cells = dict(zip(table.columns, table.rows[row], strict=True))
-        raise RecordingError(
-            table.path,
-            f"marker '{cells['marker'].strip()}' twice at {cells['time'].strip()} s",
-            "each marker once a frame",
-            "removing one of the lines, or giving each frame its own time",
-            line=table.lines[row],
-            column="marker",
-        )

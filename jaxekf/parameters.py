@@ -142,12 +142,28 @@ def load(model: Model, *paths: Path | str) -> Parameters:
             files = [f for f in (path / "noise.toml", path / "calibration.toml") if f.is_file()]
             if not files:
                 raise RecordingError(path, "a folder without noise.toml", "one", "another folder")
-        for file in files:
-            params = _read(file, model, params)
+        documents = {file: _document(file) for file in files}
+        _check_together(path, list(documents.values()))
+        for file, document in documents.items():
+            params = _filled(file, document, model, params)
     return as_arrays(params)
 
 
-def _read(path: Path, model: Model, params: Parameters) -> Parameters:
+def _check_together(folder: Path, documents: list[dict[str, Any]]) -> None:
+    """Files of one folder that tell of which tuning they are must be of one."""
+    origins = [document.get("origin") for document in documents]
+    tunings = {o["tuning"] for o in origins if isinstance(o, dict) and "tuning" in o}
+    if len(tunings) > 1:
+        raise RecordingError(
+            folder,
+            f"noise.toml and calibration.toml of the tunings {' and '.join(sorted(map(str, tunings)))}",
+            "both of one, which a kill while they were written may have prevented",
+            "tuning again, or naming both files if this is meant",
+        )
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """A file of parameters of a version that is known."""
     try:
         document = tomllib.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError:
@@ -163,6 +179,11 @@ def _read(path: Path, model: Model, params: Parameters) -> Parameters:
             str(SCHEMA_VERSION),
             "tuning again with this version",
         )
+    return document
+
+
+def _filled(path: Path, document: dict[str, Any], model: Model, params: Parameters) -> Parameters:
+    """The parameters with what a document says instead."""
     if document.get("model") != model.name:
         raise ModelError(
             f"{path}: got parameters of the model '{document.get('model')}', expected those of"

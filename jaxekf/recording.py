@@ -43,6 +43,8 @@ class Samples:
     """Per-sample data for `predict` and `noise`: a pytree of arrays (N, ...)."""
     latency_ns: int = 0
     """How long after `time_ns` a sample was known."""
+    origin: tuple[str, ...] = ()
+    """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +163,8 @@ class Recording:
     markers: Markers | None = None
     intake: Mapping[str, Intake] = field(default_factory=dict)
     """What became of the rows of each stream's source while it was read; empty of a run made in memory."""
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of each file it was read from, by name; empty where the reader did not tell."""
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):

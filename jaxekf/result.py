@@ -227,10 +227,11 @@ class Estimate:
 
         ``estimate.csv`` state, outputs and standard deviations; ``covariance.npz`` full matrices;
         ``innovations_SENSOR.csv``; ``noise.toml``, ``calibration.toml``; ``result.json`` summary,
-        account, provenance and, where it is given, the `diagnosis` (`Diagnosis.as_dict`, with its curves
-        for `jaxekf report`). `exports` adds files as by `export`: ``npz`` `estimate.npz`, ``hdf5``
-        `estimate.h5`, ``tum`` `trajectory.tum`. Where times were asked for, there is ``requested.csv``,
-        with the columns of `estimate.csv` at those, and the `exports` hold those only.
+        account, parameters, provenance with the hashes of the input files and, where it is given, the
+        `diagnosis` (`Diagnosis.as_dict`, with its curves for `jaxekf report`). `exports` adds files as by
+        `export`: ``npz`` `estimate.npz`, ``hdf5`` `estimate.h5`, ``tum`` `trajectory.tum`. Where times
+        were asked for, there is ``requested.csv``, with the columns of `estimate.csv` at those, and the
+        `exports` hold those only.
 
         Raises `RecordingError` for an output that exists, and for an excerpt.
         """
@@ -263,6 +264,7 @@ class Estimate:
                     for name in self.sensors
                 },
                 "provenance": self.provenance,
+                "parameters": self._parameters(),
             }
             if diagnosis is not None:
                 document["diagnosis"] = finite_or_null(diagnosis)
@@ -282,11 +284,32 @@ class Estimate:
                     " expected one; give the model that output, or export another format"
                 )
             place = self.outputs.get("position")
-            comments = [f"run {self.run}, model {self.model.name}"]
+            comments = [f"run {self.run}, model {self.model.name}", *self._told()]
             position = None if place is None else place.value
             export.write_tum(file, self.time_ns, self.attitude.value, position, comments)
         else:
             {"npz": export.write_npz, "hdf5": export.write_hdf5}[form](file, self._entries())
+
+    def _parameters(self) -> dict[str, Any]:
+        """Noise, initial belief, calibration and setup with their units, for JSON."""
+        described = parameters.described_arrays(self.model, self.params)
+        told: dict[str, dict[str, Any]] = {}
+        for path, (value, unit) in described.items():
+            section, name = path.split("/")
+            told.setdefault(section, {})[name] = {"value": value.tolist(), "unit": unit}
+        return finite_or_null(told)
+
+    def _told(self) -> list[str]:
+        """What an estimate was made of and how, a line of JSON each, for a file that has comments only."""
+        said = {
+            "schema_version": SCHEMA_VERSION,
+            "smoothed": self.smoothed,
+            "online": self.online,
+            "provenance": self.provenance,
+            "parameters": self._parameters(),
+            "account": self.account,
+        }
+        return [f"{key} {json.dumps(value)}" for key, value in said.items()]
 
     def _entries(self) -> dict[str, Entry]:
         """All of the estimate, by the paths of an NPZ or HDF5 file."""
@@ -296,6 +319,7 @@ class Estimate:
             "run": self.run,
             "model": self.model.name,
             "smoothed": self.smoothed,
+            "online": self.online,
             "requested_times_only": self.excerpt,
             "log_likelihood": self.log_likelihood,
         }

@@ -21,11 +21,13 @@ class Place(NamedTuple):
     """A file, or ``file.h5:imu`` for a group of data sets."""
     numbers: Indices | None = None
     """(N,) number of the line of each row; None where rows are counted from 0."""
+    samples: bool = False
+    """Whether the numbers are those of samples, counted from 0, and not of lines."""
 
     @property
     def unit(self) -> str:
         """What the numbers count."""
-        return "sample" if self.numbers is None else "line"
+        return "sample" if self.numbers is None or self.samples else "line"
 
     def number(self, row: int) -> int:
         """Line or sample of a row."""
@@ -34,16 +36,17 @@ class Place(NamedTuple):
     def take(self, chosen: Indices) -> "Place":
         """The place of some of the rows, in their order."""
         numbers = chosen if self.numbers is None else self.numbers[chosen]
-        return Place(self.path, numbers)
+        return Place(self.path, numbers, self.unit == "sample")
 
     def error(
         self, row: int | None, column: str | None, got: str, expected: str, hint: str
     ) -> RecordingError:
         """A fault of one row, or of all of them."""
-        if row is None or self.numbers is not None:
+        if row is None or self.unit == "line":
             line = None if row is None else self.number(row)
             return RecordingError(self.path, got, expected, hint, line=line, column=column)
-        whole = f"{self.path}/{column}[{row}]" if column else f"{self.path}[{row}]"
+        number = self.number(row)
+        whole = f"{self.path}/{column}[{number}]" if column else f"{self.path}[{number}]"
         return RecordingError(whole, got, expected, hint)
 
 
@@ -62,6 +65,16 @@ class Reason:
         return len(self.numbers)
 
 
+class Part(NamedTuple):
+    """Rows of one part of a stream whose rows are of several, such as one marker's."""
+
+    rows: int
+    dropped: Times
+    """Stamps of its rows that were dropped."""
+    absent: Times
+    """Stamps of the stream's samples for which this part has no row."""
+
+
 @dataclass(frozen=True)
 class Intake:
     """What became of the rows of one stream."""
@@ -73,6 +86,11 @@ class Intake:
     notes: tuple[str, ...] = ()
     """What else was done, in sentences."""
     unit: str = "line"
+    numbers: Indices | None = None
+    """(N,) line or sample of each sample of the stream, which may be fewer than rows."""
+
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    """Of each marker, by its name."""
 
     def sentences(self, label: str) -> tuple[str, ...]:
         """One warning for each reason, with count and first and last place."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxekf import rest, storage
 from jaxekf.allan import Curve, ImuNoise, SensorNoise, imu_noise
+from jaxekf.containers import is_container
 from jaxekf.densities import Estimated
 from jaxekf.errors import RecordingError
 from jaxekf.model import Model, Parameters
@@ -49,8 +50,9 @@ class Start(NamedTuple):
 
 
 def read_log(path: Path | str) -> Recording:
-    """A recorded run's folder, or a CSV file with the columns of `imu.csv`."""
-    return storage.load_imu(path) if Path(path).is_file() else storage.load(path)
+    """A recorded run, or a CSV file with the columns of `imu.csv`."""
+    alone = Path(path).is_file() and not is_container(path)
+    return storage.load_imu(path) if alone else storage.load(path)
 
 
 def static_noise(

@@ -9,76 +9,146 @@ Times are decimal seconds, read exactly to the nanosecond. `recording.toml` says
 Folders are written whole or not at all.
 """
 
+import hashlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
 
-from jaxekf import description, encoder_storage, marker_storage
-from jaxekf.description import SCHEMA_VERSION
+from jaxekf import containers, description, encoder_storage, intake, marker_storage, stated
+from jaxekf.description import SCHEMA_VERSION, Source
 from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_folder
-from jaxekf.recording import Floats, Imu, Optical, Recording, unit_quaternions
+from jaxekf.hashes import hashed
+from jaxekf.intake import without_repeats
+from jaxekf.recording import Floats, Imu, Optical, Recording, Times
+from jaxekf.rows import Intake, Reason
 from jaxekf.tables import (
     POSITION,
     QUATERNION,
     Sheet,
     Table,
-    finite_numbers,
     need_columns,
     numbers,
     read_table,
-    read_times,
     reported,
+    stamps,
+    words,
     write_sheet,
 )
 
 __all__ = ["SCHEMA_VERSION", "joint_attitude", "load", "load_imu", "save"]
 
 
-def load(path: Path | str) -> Recording:
+def load(path: Path | str, *, sort: bool = False) -> Recording:
     """Read a recorded run. Raises `RecordingError`, which names file, line and column.
 
     What `recording.toml` says besides becomes `Recording.info`: its own entries by their names (see
-    `description.facts`), and what is left of a stream's section as ``optical_about`` and so on.
+    `description.facts`), and what is left of a stream's section as ``optical_about`` and so on. Rows that
+    are not to be believed are masked and those that are none dropped: `Recording.intake` has the account.
+    With `sort` rows that are out of order are put in order of time.
     """
-    folder = Path(path)
+    if containers.is_container(path):
+        made = containers.load(path, sort=sort)
+        made = made.replace(sources=made.sources or hashed(path))
+    else:
+        made = _load_folder(Path(path), sort)
+    return without_repeats(made)
+
+
+def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / description.FILE
-    for label, form in _FORMS.items():
-        description.check_section(place, label, about.get(label, {}), form.described)
+    hashes = _hashes(about, place)
     read: dict[str, Any] = {}
+    accounts: dict[str, Intake] = {}
+    sources = hashed(place)
     for label, form in _FORMS.items():
-        file = folder / f"{label}.csv"
+        section = about.get(label, {})
+        description.check_section(place, label, section, form.described)
+        how = stated.layout(label, section, place)
+        file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
-            read[label] = form.read(read_table(file), about.get(label, {}))
+            table = read_table(file, how)
+            _check_hash(table, hashes)
+            sources[file.name] = table.text.sha256
+            stream, account = form.read(table, Source(section, place, sort))
+            read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
         files = " or ".join(f"{label}.csv" for label in _FORMS)
         raise RecordingError(folder, "no stream", files, "another folder")
-    info = {key: about[key] for key in about if key not in _FORMS}
+    info = {key: about[key] for key in about if key not in (*_FORMS, "sha256")}
     info |= description.facts(info, place)
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
-    return Recording(name, **read, info=info, path=folder)
+    return Recording(name, **read, info=info, path=folder, intake=accounts, sources=sources)
+
+
+def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
+    """What ``[sha256]`` says of the files of a run, by their names."""
+    said = about.get("sha256", {})
+    if not isinstance(said, dict) or not all(isinstance(v, str) for v in said.values()):
+        raise RecordingError(
+            place,
+            f"sha256 = {said!r}",
+            "a section with a hash for each file",
+            "correcting or removing it",
+            column="sha256",
+        )
+    return said
+
+
+def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
+    expected = hashes.get(table.path.name)
+    if expected is not None and expected.lower() != table.text.sha256:
+        raise RecordingError(
+            table.path,
+            f"content of sha256 {table.text.sha256[:12]}...",
+            f"{expected[:12]}... as recording.toml says",
+            "restoring the file, or removing its hash under [sha256] where it was changed on purpose",
+        )
 
 
 def load_imu(path: Path | str) -> Recording:
     """An IMU alone, from a CSV file with the columns of `imu.csv`."""
     file = Path(path)
-    return Recording(file.stem, imu=_read_imu(read_table(file), {}), path=file)
+    table = read_table(file)
+    imu, account = _read_imu(table, Source({}, file, False))
+    account = _completed(account, table, imu.time_ns)
+    return Recording(file.stem, imu=imu, path=file, intake={"imu": account})
+
+
+def _completed(account: Intake, table: Table, time_ns: Times) -> Intake:
+    """With the rows that the file ends in the middle of, and how it was read."""
+    account = replace(account, notes=(*table.text.notes, *account.notes))
+    if not table.text.cut:
+        return account
+    lines = np.array(table.text.cut, np.intp)
+    reason = Reason(lines, np.repeat(time_ns[-1:], len(lines)))
+    return replace(account, rows=account.rows + len(lines)).with_masked("cut short", reason)
 
 
 def save(
-    recording: Recording, path: Path | str, *, overwrite: bool = False, digits: int = 17
+    recording: Recording,
+    path: Path | str,
+    *,
+    overwrite: bool = False,
+    digits: int = 17,
+    hashes: bool = False,
 ) -> Path:
     """Write a run as a folder; what is hidden becomes blank cells. Returns the folder.
 
-    `load` gives the same run again; with fewer `digits`, its samples rounded. Raises `RecordingError`
+    `load` gives the same run again; with fewer `digits`, its samples rounded. With `hashes` the SHA-256 of
+    every file is in `recording.toml`, and `load` refuses files that were changed since. Raises
+    `RecordingError`
     where the folder may not be written, or the run could not be read again.
     """
+    if containers.is_container(path):
+        return containers.save(recording, path, overwrite=overwrite)
     about: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "name": recording.name}
     about |= {
         k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about
@@ -92,33 +162,40 @@ def save(
             section = _left(recording.info.get(f"{label}_about", {}), form)
             sheet, about[label] = form.write(stream, section)
             write_sheet(folder / f"{label}.csv", sheet, digits)
+        if hashes:
+            about["sha256"] = {
+                file.name: hashlib.sha256(file.read_bytes()).hexdigest()
+                for file in sorted(folder.glob("*.csv"))
+            }
         (folder / description.FILE).write_text(tomli_w.dumps(about), "utf-8")
     return Path(path)
 
 
-def _read_optical(table: Table, about: Mapping[str, Any]) -> Optical:
+def _read_optical(table: Table, source: Source) -> tuple[Optical, Intake]:
     need_columns(table, "time,qw,qx,qy,qz[,x,y,z][,status][,error]")
-    place = table.path.with_name(description.FILE)
-    q, valid = unit_quaternions(numbers(table, QUATERNION, blank=True))
-    position = p_body_tool = None
+    about, place = source.about, source.place
+    turning = stated.turning("optical", about, place)
+    _, length = stated.factors("optical", about, place)
+    position = p_body_tool = status = None
     if set(POSITION) <= set(table.columns):
-        position = numbers(table, POSITION, blank=True)
+        position = length * numbers(table, POSITION, blank=True)
     if "status" in table.columns:
-        at = table.columns.index("status")
-        words = about.get("status_ok", ["ok", "0"])
-        words = words if isinstance(words, list) else [words]
-        good = {str(word).strip().lower() for word in words}
-        valid &= np.array([row[at].strip().lower() in good for row in table.rows])
+        status = words(table, "status")
     if "p_body_tool" in about:
         p_body_tool = description.finite_vector(
             about["p_body_tool"], 3, place, "optical.p_body_tool"
         )
-    return Optical(
-        read_times(table),
-        q,
-        valid,
+    error = reported(table, "error", least=0.0)
+    return intake.optical(
+        table.place,
+        stamps(table),
+        turning.standard(numbers(table, turning.columns(table.columns), blank=True)),
         position,
-        error=reported(table, "error", least=0.0),
+        status=status,
+        status_ok=description.words(about, "optical", "status_ok", intake.STATUS_OK, place),
+        error=None if error is None else length * error,
+        error_max=description.limit(about, "optical", "error_max", place),
+        sort=source.sort,
         p_body_tool=p_body_tool,
         latency_ns=description.latency_ns(about, "optical", place),
     )
@@ -141,17 +218,21 @@ def _write_optical(stream: Optical, about: dict[str, Any]) -> tuple[Sheet, dict[
     return Sheet(columns, stream.time_ns, np.concatenate(values, axis=1)), about
 
 
-def _read_imu(table: Table, about: Mapping[str, Any]) -> Imu:
+def _read_imu(table: Table, source: Source) -> tuple[Imu, Intake]:
     need_columns(table, "time,gx,gy,gz[,ax,ay,az][,mx,my,mz]")
+    rate, force = stated.factors("imu", source.about, source.place)
 
     def maybe(names: tuple[str, ...]) -> Floats | None:
-        return finite_numbers(table, names) if set(names) <= set(table.columns) else None
+        return numbers(table, names, blank=True) if set(names) <= set(table.columns) else None
 
-    return Imu(
-        read_times(table),
-        finite_numbers(table, ("gx", "gy", "gz")),
-        maybe(("ax", "ay", "az")),
+    accelerometer = maybe(("ax", "ay", "az"))
+    return intake.imu(
+        table.place,
+        stamps(table),
+        rate * numbers(table, ("gx", "gy", "gz"), blank=True),
+        None if accelerometer is None else force * accelerometer,
         maybe(("mx", "my", "mz")),
+        sort=source.sort,
     )
 
 
@@ -170,7 +251,7 @@ def _write_imu(stream: Imu, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
 class _Form(NamedTuple):
     """How a stream of `Recording` is held on disk."""
 
-    read: Callable[[Table, Mapping[str, Any]], Any]
+    read: Callable[[Table, Source], tuple[Any, Intake]]
     write: Callable[[Any, dict[str, Any]], tuple[Sheet, dict[str, Any]]]
     described: Mapping[str, str]
     """What its section of `recording.toml` says, where it says it."""
@@ -183,7 +264,7 @@ _FORMS = {
         _read_optical,
         _write_optical,
         {"kind": "pose", "quaternion": description.BODY_TO_REFERENCE, "unit": "1, m"},
-        ("status_ok", "p_body_tool", "latency"),
+        ("status_ok", "error_max", "p_body_tool", "latency"),
     ),
     "markers": _Form(
         marker_storage.read,
@@ -198,4 +279,5 @@ _FORMS = {
 
 def _left(section: Mapping[str, Any], form: _Form) -> dict[str, Any]:
     """A section without what the stream holds: each is said in one place only."""
-    return {key: value for key, value in section.items() if key not in form.held}
+    held = (*form.held, *stated.HELD)
+    return {key: value for key, value in section.items() if key not in held}

@@ -11,11 +11,12 @@ import numpy as np
 from jaxekf import ekf, manifold, padding
 from jaxekf.errors import FilterError, ModelError
 from jaxekf.estimation import evaluate_outputs, require_float64
+from jaxekf.gaps import LONGEST_INPUT_GAP_S
 from jaxekf.kernels import jit
 from jaxekf.model import Belief, Model, Parameters, Sensor
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import NANOSECONDS, Floats
-from jaxekf.timeline import LONGEST_INPUT_GAP_S, Rows, Steps, knots_from
+from jaxekf.timeline import Rows, Steps, knots_from
 
 _INPUT_KEPT_NS = NANOSECONDS
 """The input before the horizon that a clock offset may reach back to."""

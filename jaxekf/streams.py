@@ -1,5 +1,7 @@
 """What is done to the samples of one stream before they are laid out in time: chosen, counted, held."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -7,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf.recording import Samples, Times, period_ns
+from jaxekf.rows import Intake
 
 
 def visible(samples: Samples) -> NDArray[np.bool_]:
@@ -34,18 +37,50 @@ def count(samples: Samples, start: int, end: int) -> dict[str, int]:
     }
 
 
+def of_rows(
+    account: dict[str, int], samples: Samples, intake: Mapping[str, Intake], start: int, end: int
+) -> dict[str, int]:
+    """The account of a stream in rows of the source that it was read from, where that is known.
+
+    Rows that are no samples come on top: those dropped while reading, and those masked that the stream
+    leaves out. A marker that has no row in a frame does not count there.
+    """
+    stream = intake.get(samples.origin[0]) if samples.origin else None
+    if stream is None:
+        return account
+    account = dict(account)
+    if len(samples.origin) > 1:
+        part = stream.parts.get(samples.origin[1])
+        if part is None:
+            return account | {"read": 0, "masked": 0, "dropped_outside_run": 0}
+        taken = part.absent - samples.latency_ns
+        inside = int(((taken >= start) & (taken <= end)).sum())
+        account["masked"] -= inside
+        account["dropped_outside_run"] -= len(taken) - inside
+        dropped = {"repeated": len(part.dropped)} if len(part.dropped) else {}
+        rows = part.rows
+    else:
+        dropped = {name: reason.count for name, reason in stream.dropped.items()}
+        rows = stream.rows
+        # Masked rows that an input, which cannot be masked, leaves out.
+        account["masked"] += rows - sum(dropped.values()) - account["read"]
+    for name, number in dropped.items():
+        account[f"dropped_{name}"] = number
+    return account | {"read": rows}
+
+
 def take(samples: Samples, chosen: NDArray[Any]) -> Samples:
     """The chosen samples, by index or mask."""
 
     def pick(tree: Any) -> Any:
         return jax.tree.map(lambda a: np.asarray(a)[chosen], tree)
 
-    return Samples(
-        samples.time_ns[chosen],
-        pick(samples.value),
-        samples.mask[chosen],
-        pick(samples.aux),
-        samples.latency_ns,
+    return replace(
+        samples,
+        time_ns=samples.time_ns[chosen],
+        value=pick(samples.value),
+        mask=samples.mask[chosen],
+        aux=pick(samples.aux),
     )
 
 

@@ -7,7 +7,7 @@ is not paid for at every fast step. Epochs that are not full are padded **in fro
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -15,15 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf.errors import ModelError, RecordingError
+from jaxekf.gaps import LONGEST_INPUT_GAP_S, longest_ns
 from jaxekf.model import Model, Sensor, Start
 from jaxekf.recording import NANOSECONDS, Recording, Samples, Times, period_ns
 from jaxekf.requested import Requested, within
-from jaxekf.streams import count, cut, first_visible, hold, take, visible
+from jaxekf.streams import count, cut, first_visible, hold, of_rows, take, visible
 
 _UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
 _LONGEST_EPOCH = 32
-LONGEST_INPUT_GAP_S = 0.1
-"""An input is interpolated over shorter gaps; over longer ones the motion is not known."""
+_EXTRAPOLATED_S = 0.5
+"""A time without any sample from which on a user is told."""
 
 
 class Rows(NamedTuple):
@@ -115,9 +116,13 @@ def build(
     if model.input is not None:
         driver = _check_input(model.input.source(recording), recording, model.input.name)
     start, end, found = _span(model, recording, samples, driver)
-    account = {name: count(stream, start, end) for name, stream in samples.items()}
+    counted = dict(samples)
     if driver is not None and model.input is not None:
-        account[model.input.name] = count(driver, start, end)
+        counted[model.input.name] = driver
+    account = {
+        name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
+        for name, stream in counted.items()
+    }
     samples = {name: cut(stream, start, end) for name, stream in samples.items()}
     if model.hold_to is not None:
         samples = hold(samples, model.hold_to, account)
@@ -126,6 +131,10 @@ def build(
         inside = (driver.time_ns >= start) & (driver.time_ns <= end)
         events.append(driver.time_ns[inside])
     notes = (found.note,) if found is not None and found.note else ()
+    if part := recording.info.get("part"):
+        notes = (f"part {part}", *notes)
+    if driver is None and model.hold_to is None:
+        notes += _long_silence(samples, start)
     asked = measured = None
     if at is not None and model.hold_to is not None:
         raise ModelError(
@@ -191,7 +200,7 @@ def _read(sensor: Sensor, recording: Recording) -> Samples:
     if mask.ndim == 1:
         mask = np.repeat(mask[:, None], sensor.rows, axis=1)
     aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)
-    return Samples(samples.time_ns, samples.value, mask, aux, samples.latency_ns)
+    return replace(samples, mask=mask, aux=aux)
 
 
 def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
@@ -226,15 +235,30 @@ def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
         )
     steps = np.diff(driver.time_ns)
     longest = int(np.argmax(steps))
-    if steps[longest] > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * period_ns(driver.time_ns)):
+    if steps[longest] > longest_ns(driver.time_ns):
         begin = driver.time_ns[longest] / NANOSECONDS
         raise RecordingError(
             place,
             f"a gap of {steps[longest] / NANOSECONDS:.3f} s in {name} at {begin:.6f} s",
             f"none longer than {LONGEST_INPUT_GAP_S} s",
-            "cutting the run there, or a model that measures it (loose_rate)",
+            "cutting the run there (jaxekf.split_at_gaps), or a model that measures it (loose_rate)",
         )
     return driver
+
+
+def _long_silence(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
+    """A sentence where for long no sensor saw anything."""
+    seen = [stream.time_ns[visible(stream)] for stream in samples.values()]
+    times = np.unique(np.concatenate(seen))
+    steps = np.diff(times) / NANOSECONDS
+    long = np.flatnonzero(steps > _EXTRAPOLATED_S)
+    if not long.size:
+        return ()
+    at = ", ".join(f"{(times[i] - start) / NANOSECONDS:.3f}" for i in long[:5])
+    return (
+        f"from {at} s{' and later' if long.size > 5 else ''} on no sensor saw anything for up to"
+        f" {steps[long].max():.3f} s: there the estimate is extrapolated",
+    )
 
 
 def _describe(times: Times) -> str:

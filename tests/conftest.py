@@ -1,6 +1,7 @@
 """Settings and fixtures shared by all tests."""
 
 import atexit
+import functools
 import os
 import shutil
 import tempfile
@@ -9,6 +10,8 @@ from pathlib import Path
 import jax
 import pytest
 from hypothesis import settings
+
+from jaxekf.result import Estimate
 
 # Nearly all tests wait for the compiler, not for what it made. Those of the filter itself, and the long
 # forms, are compiled as users have it.
@@ -38,6 +41,23 @@ def _forget_compiled_programs():
     have only so many, and the compiler crashes when they run out."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _accounts_close():
+    """In every test that makes an estimate: rows read = used + masked + gated + dropped, exactly."""
+    made = Estimate.__init__
+
+    @functools.wraps(made)
+    def checked(self, *given, **named):
+        made(self, *given, **named)
+        for name, account in self.account.items():
+            rest = sum(account.values()) - account["read"]
+            assert account["read"] == rest, f"the account of {name} does not close: {account}"
+
+    Estimate.__init__ = checked
+    yield
+    Estimate.__init__ = made
 
 
 @pytest.fixture(scope="session")

@@ -137,7 +137,7 @@ def test_tum_is_exact(made, tmp_path):
     assert not numbers[:, :3].any()
     assert any("zero" in line for line in head)
     assert re.fullmatch(
-        r"\d{10}\.\d{9} 0 0 0 .*", (tmp_path / "run.tum").read_text().splitlines()[3]
+        r"\d{10}\.\d{9} 0 0 0 .*", (tmp_path / "run.tum").read_text().splitlines()[len(head)]
     )
 
 

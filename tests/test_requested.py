@@ -168,7 +168,7 @@ def test_command_line(tmp_path):
     lines = (folder / "trajectory.tum").read_text("utf-8").splitlines()
     assert sum(not line.startswith("#") for line in lines) == 5
     whole = tables.read_table(folder / "estimate.csv")
-    assert len(whole.rows) == len(made.time_ns)
+    assert len(whole) == len(made.time_ns)
     assert json.loads((folder / "result.json").read_text("utf-8"))["requested"] == 5
     result = call("estimate", *runs, "-o", tmp_path / "two", "--every", 0.01, "--json")
     assert result.exit_code == 0, result.output

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import jaxekf
 from jaxekf import encoder_storage, files, simulate, storage, tables
+from jaxekf.description import Source
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Encoder, Imu, Optical, Recording
 
@@ -84,8 +85,10 @@ def test_encoder_frames_and_sides(tmp_path):
             "q_zero": np.roll(zero.as_quat(), 1).tolist(),
             "q_optical_encoder": np.roll(frame.as_quat(), 1).tolist(),
         }
-        table = tables.Table(tmp_path, ("time", "angle"), [["0", "0.7"]], [2])
-        return Rotation.from_quat(np.roll(encoder_storage.read(table, about).q_ref_body[0], -1))
+        (tmp_path / "encoder.csv").write_text("time,angle\n0,0.7\n")
+        table = tables.read_table(tmp_path / "encoder.csv")
+        stream, _ = encoder_storage.read(table, Source(about, tmp_path, sort=False))
+        return Rotation.from_quat(np.roll(stream.q_ref_body[0], -1))
 
     for side, expected in (("reference", frame * turn * zero), ("body", frame * zero * turn)):
         assert (read(side).inv() * expected).magnitude() < 1e-12
@@ -119,8 +122,8 @@ CASES = {
     "no axis": (lambda f: edit(f / "recording.toml", "axis =", "axes ="), "axis = [x, y, z]", None),
     "not TOML": (lambda f: (f / "recording.toml").write_text("a = = 1"), "not TOML", None),
     "axis of nothing": (lambda f: edit(f / "recording.toml", "1.0,", "0.0,"), "encoder.axis", None),
-    "other unit": (lambda f: edit(f / "recording.toml", "rad/s, m/s^2", "deg/s"), "deg/s", None),
-    "other order": (lambda f: edit(f / "recording.toml", "w,x,y,z,", "x,y,z,w,"), "x,y,z,w", None),
+    "other unit": (lambda f: edit(f / "recording.toml", "rad/s, m/s^2", "rpm"), "'rpm'", None),
+    "other order": (lambda f: edit(f / "recording.toml", "w,x,y,z,", "x,y,z,x,"), "x,y,z,x", None),
     "name of a path": (
         lambda f: edit(f / "recording.toml", 'name = "run"', 'name = "../x"'),
         "../x",

@@ -324,8 +324,8 @@ FAULTS = {
     ),
     "marker twice": (
         set_cell("markers", 1, "marker", "tip"),
-        ["'tip' twice at 1700000000.1", "once a frame"],
-        (3, "marker"),
+        ["'tip' at 1700000000.1", "twice with other numbers", "once a frame"],
+        (3, "time"),
     ),
     "frame torn apart": (
         lambda f: swap_lines(f / "markers.csv", 3, 4),
@@ -347,7 +347,7 @@ FAULTS = {
     ),
     "one time twice in another stream": (
         lambda f: edit(f / "optical.csv", "1700000000.143456789", "1700000000.133456789"),
-        ["optical.csv", "times that increase"],
+        ["optical.csv", "twice with other numbers", "each time once"],
         (4, "time"),
     ),
     "no marker column": (
@@ -410,7 +410,7 @@ FAULTS = {
         ["'pose'", "'markers'"],
         (None, "markers.kind"),
     ),
-    "other unit": (entry("markers.unit", "mm"), ["'mm'", "'m'"], (None, "markers.unit")),
+    "other unit": (entry("markers.unit", "ft"), ["'ft'", "m or cm or mm"], (None, "markers.unit")),
     "negative latency": (
         entry("markers.latency", -0.01),
         ["-0.01", "0 or more"],

@@ -1,12 +1,14 @@
 """The tuner: gradient steps over all training runs at once, judged on runs it does not learn from."""
 
 import datetime
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -14,6 +16,8 @@ import optax
 from jaxekf import parameters
 from jaxekf.errors import TuningError
 from jaxekf.estimation import Run, provenance, read, require_float64
+from jaxekf.files import whole_set
+from jaxekf.hashes import inputs_of
 from jaxekf.model import Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.parameters import as_arrays
@@ -68,6 +72,16 @@ class Tuned:
     """Of all training runs, without a gradient: see `Descent.filterings`; one for the scale."""
     starts: tuple[Outcome, ...] = ()
     """What became of each start, the given one first, where there were several."""
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Of each run that it saw, by name, the SHA-256 of every file it was read from."""
+
+    @property
+    def digest(self) -> str:
+        """Tells this tuning's files from another's: each has it among where it came from."""
+        told = hashlib.sha256(repr((self.model.name, sorted(self.each))).encode())
+        for leaf in jax.tree.leaves((self.params, self.each)):
+            told.update(np.asarray(leaf, float).tobytes())
+        return told.hexdigest()[:16]
 
     @property
     def rejections(self) -> int:
@@ -124,13 +138,23 @@ class Tuned:
         """Write `noise.toml` and `calibration.toml`, with units and where they came from; where runs have
         parameters of their own also ``runs/NAME`` with the same files for each. `tuning.json` beside them
         is for `jaxekf report`; the other arguments add to it what `tuning.save_record` says.
+
+        A new folder is there whole or not at all. Where an earlier tuning is replaced, each file is whole,
+        and the ``tuning`` in their origins tells those of one from those of another: `load_parameters`
+        and the report refuse what a kill left of two.
         """
         told = record(self, rows=rows, judged_on=judged_on, folds=folds)
-        parameters.save(folder, self.model, self.params, self.origin)
-        of_runs = Path(folder) / "runs"
-        for name, params in self.each.items():
-            parameters.save(of_runs / name, self.model, params, self.origin)
-        parameters.forget(of_runs, keep=self.each)
+        origin = self.origin | {"tuning": self.digest}
+        with whole_set(folder) as made:
+            parameters.save(made, self.model, self.params, origin | {"inputs": self.inputs})
+            for name, params in self.each.items():
+                own = {key: files for key, files in self.inputs.items() if key == name}
+                of_run = made / "runs" / name
+                parameters.save(of_run, self.model, params, origin | {"inputs": own})
+        if not parameters.leaf_names(self.params.calibration):
+            # What an earlier model left there must not be read beside this one's noise.
+            (Path(folder) / "calibration.toml").unlink(missing_ok=True)
+        parameters.forget(Path(folder) / "runs", keep=self.each)
         write_record(folder, told)
 
 
@@ -221,6 +245,7 @@ def tune(
     tuned = _told(search, known, stopped, _names(learnt), _names(judging), rescale=rescale)
     if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
+    tuned = replace(tuned, inputs=inputs_of([*learnt, *judging]))
     return _of_all_starts(tuned, race, search) if starts > 1 else tuned
 
 

@@ -90,6 +90,7 @@ def pack_tuned(tuned: Tuned) -> dict[str, Any]:
         "stopped": tuned.stopped,
         "scale": tuned.scale,
         "origin": json.dumps(tuned.origin),
+        "inputs": json.dumps(tuned.inputs),
         "free": tuned.free,
         "fixed": tuned.fixed,
         "evaluations": tuned.evaluations,
@@ -140,6 +141,8 @@ def unpack_tuned(
         evaluations=int(kept["evaluations"]),
         filterings=float(kept["filterings"]),
         starts=tuple(Outcome(**one) for one in json.loads(str(kept["starts"]))),
+        # What an earlier version kept does not tell.
+        inputs=json.loads(str(kept.get("inputs", "{}"))),
     )
 
 

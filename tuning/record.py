@@ -69,6 +69,8 @@ def record(
         "validation_runs": list(origin.get("validation_runs", [])),
         "date": origin.get("date"),
         "provenance": {key: value for key, value in origin.items() if key not in _SAID},
+        "tuning": tuned.digest,
+        "inputs": tuned.inputs,
         "stopped": tuned.stopped,
         "evaluations": int(tuned.evaluations),
         "rejected_steps": int(tuned.rejections),

@@ -1,4 +1,4 @@
-"""The command line: simulate, check, allan, align, estimate, tune, plot, report, demo."""
+"""The command line: simulate, import, check, allan, align, estimate, tune, plot, report, demo."""
 
 import click
 import jax
@@ -10,6 +10,7 @@ from jaxekf.cli.check import check
 from jaxekf.cli.console import Commands
 from jaxekf.cli.demo import demo
 from jaxekf.cli.estimate import estimate
+from jaxekf.cli.imports import import_run
 from jaxekf.cli.machine import prepare
 from jaxekf.cli.plot import plot
 from jaxekf.cli.report import report
@@ -28,5 +29,5 @@ def main() -> None:
     prepare()
 
 
-for command in (simulate, check, allan, align, estimate, tune, plot, report, demo):
+for command in (simulate, import_run, check, allan, align, estimate, tune, plot, report, demo):
     main.add_command(command)

@@ -23,9 +23,13 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    sort_option,
 )
 from jaxekf.cli.estimate import load_runs
+from jaxekf.description import SCHEMA_VERSION
+from jaxekf.estimation import provenance
 from jaxekf.files import check_output, finite_or_null, whole_folder
+from jaxekf.hashes import inputs_of
 from jaxekf.models import get_model
 from jaxekf.recording import Floats
 
@@ -33,12 +37,15 @@ from jaxekf.recording import Floats
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @model_option
+@sort_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("aligned"), show_default=True
 )
 @overwrite_option
 @json_option
-def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_json: bool) -> None:
+def align(
+    runs: tuple[Path, ...], model: str, sort: bool, output: Path, overwrite: bool, as_json: bool
+) -> None:
     """Clock offset and alignment between tracker and IMU, from the angular rates of RUNS.
 
     Latency: seconds that the tracker's samples are older than stamped, in the middle of the run, beyond
@@ -47,7 +54,8 @@ def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_
     """
     check_output(output, "align.json", overwrite=overwrite)
     chosen = get_model(model)
-    found = [align_run(recording) for recording in load_runs(runs)]
+    recordings = load_runs(runs, sort=sort)
+    found = [align_run(recording) for recording in recordings]
     mean = together(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:
@@ -55,15 +63,19 @@ def align(runs: tuple[Path, ...], model: str, output: Path, overwrite: bool, as_
             note(f"{run.run}: {text}")
     for text in (*mean.sentences(), *sentences):
         note(text)
+    made_of = provenance() | {"inputs": inputs_of(recordings)}
     document = {
+        "schema_version": SCHEMA_VERSION,
+        "kind": "jaxekf alignment",
         "model": chosen.name,
         "runs": [run_document(run) for run in found],
         "together": _together(mean),
         "calibration": parameters.to_document(chosen, params, {})["calibration"],
         "notes": [*mean.sentences(), *sentences],
+        "provenance": made_of,
     }
     with whole_folder(output, "align.json", overwrite=overwrite) as folder:
-        origin = {"aligned": [run.run for run in found]}
+        origin = {"aligned": [run.run for run in found]} | made_of
         parameters.save_calibration(folder, chosen, params, origin)
         text = json.dumps(finite_or_null(document), indent=2)
         (folder / "align.json").write_text(text + "\n", "utf-8")

@@ -17,7 +17,9 @@ from jaxekf.cli.console import (
     print_table,
 )
 from jaxekf.densities import Estimated
+from jaxekf.estimation import provenance
 from jaxekf.files import check_output, whole_folder
+from jaxekf.hashes import inputs_of
 from jaxekf.models import get_model
 from jaxekf.plots.deviations import allan as draw
 from jaxekf.plots.style import save
@@ -59,7 +61,8 @@ def allan(
     """
     check_output(output, "allan.csv", overwrite=overwrite)
     chosen = get_model(model)
-    found = static_noise(read_log(log), begin_s, end_s)
+    recording = read_log(log)
+    found = static_noise(recording, begin_s, end_s)
     start = start_for(chosen, found)
     note(
         f"{found.run}: rests from {found.begin_s:.1f} to {found.end_s:.1f} s, {found.imu.samples} samples"
@@ -72,6 +75,7 @@ def allan(
         write_curve(folder / "allan.csv", found)
         save(draw(found), folder / "allan.png")
         origin = {"rest": found.run, "seconds": found.imu.duration_s, "found": list(start.taken)}
+        origin |= provenance() | {"inputs": inputs_of([recording])}
         parameters.save_noise(folder, chosen, start.params, origin)
     note(f"wrote {output}: noise.toml for {chosen.name} sets {', '.join(start.taken) or 'nothing'}")
     if as_json:

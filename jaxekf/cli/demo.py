@@ -12,8 +12,11 @@ from jaxekf.cli.comparison import print_comparison
 from jaxekf.cli.console import json_option, note, print_json, tuning_progress
 from jaxekf.cli.plot import draw
 from jaxekf.datasets import demo as runs
+from jaxekf.description import SCHEMA_VERSION
 from jaxekf.diagnostics import diagnose
+from jaxekf.estimation import provenance
 from jaxekf.files import check_output, whole_folder
+from jaxekf.hashes import inputs_of
 from jaxekf.models import get_model
 from jaxekf.parameters import as_arrays
 from jaxekf.plots import possible_figures
@@ -45,6 +48,7 @@ def demo(output: Path, as_json: bool) -> None:
         [load(path) for path in runs.paths(names)]
         for names in (runs.TRAINING, runs.VALIDATION, runs.TESTING)
     )
+    every = [*training, *validation, *testing]
     note(f"tuning on {', '.join(runs.TRAINING)}; validating on {', '.join(runs.VALIDATION)}")
     with tuning_progress(_ITERATIONS) as progress:
         tuned = tuning.tune(
@@ -69,6 +73,9 @@ def demo(output: Path, as_json: bool) -> None:
             files = draw(made, recording, folder / "figures", chosen)
             figures += [str(output / "figures" / file.name) for file in files]
         document = {
+            "schema_version": SCHEMA_VERSION,
+            "kind": "jaxekf demo",
+            "provenance": provenance() | {"inputs": inputs_of(every)},
             "rows": as_dicts(compared.rows),
             "mean_attitude_rmse_deg": tuning.mean_by_variant(compared.rows),
             "noise_deg": {
@@ -76,9 +83,10 @@ def demo(output: Path, as_json: bool) -> None:
                 for name, value in tuned.params.noise._asdict().items()
             },
             "figures": figures,
-            "seconds": round(time.perf_counter() - began, 1),
         }
         (folder / "demo.json").write_text(json.dumps(document, indent=2) + "\n", "utf-8")
+    # Beside the file, not in it: what is written of the same runs is the same.
+    document["seconds"] = round(time.perf_counter() - began, 1)
     if as_json:
         print_json(document)
         return

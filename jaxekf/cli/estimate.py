@@ -7,7 +7,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import manifold, metrics, parameters, storage
+from jaxekf import manifold, memory, metrics, parameters, storage
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -17,12 +17,16 @@ from jaxekf.cli.console import (
     print_json,
     print_table,
     robust_option,
+    sort_option,
+    wrote,
 )
 from jaxekf.diagnostics import Diagnosis, diagnose, diagnose_many
 from jaxekf.errors import RecordingError
 from jaxekf.estimation import estimate_many
 from jaxekf.export import FILES
 from jaxekf.files import check_output
+from jaxekf.gaps import split_at_gaps
+from jaxekf.model import Model
 from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
@@ -31,16 +35,54 @@ from jaxekf.result import Estimate
 from jaxekf.robust import Means, robust
 
 
-def load_runs(paths: Sequence[Path]) -> list[Recording]:
-    """Read runs; each must have a name of its own, since results are named after them."""
-    recordings = [storage.load(path) for path in paths]
+def load_runs(
+    paths: Sequence[Path], *, sort: bool = False, model: Model | None = None
+) -> list[Recording]:
+    """Read runs; each must have a name of its own, since results are named after them.
+
+    What was masked or dropped is said. For a `model` that an IMU drives a run is cut at the IMU's gaps.
+    """
+    recordings = []
+    for path in paths:
+        with memory.for_runs([path.name]):
+            recordings.append(storage.load(path, sort=sort))
     names = [recording.name for recording in recordings]
     for path, name in zip(paths, names, strict=True):
         if names.count(name) > 1:
             raise RecordingError(
                 path, f"the name '{name}' twice", "runs with different names", "renaming one"
             )
-    return recordings
+    for recording in recordings:
+        for label, account in recording.intake.items():
+            for text in account.sentences(label):
+                note(f"{recording.name}: {text}")
+    if model is None or model.input is None:
+        return recordings
+    return [part for recording in recordings for part in _parts(recording)]
+
+
+def _parts(recording: Recording) -> list[Recording]:
+    """The parts of a run that can be estimated; what is left out is said, with its rows."""
+    good, bad = split_at_gaps(recording)
+    for part in bad:
+        rows = ", ".join(f"{account.rows} of {label}" for label, account in part.intake.items())
+        note(
+            f"{recording.name}: {part.name} is left out, too short or without a sample of the tracker"
+            f" ({rows or 'no rows'})"
+        )
+    if len(good) + len(bad) > 1:
+        note(
+            f"{recording.name}: the IMU has gaps, over which nothing is made up:"
+            f" {len(good)} of {len(good) + len(bad)} parts are estimated, each for itself"
+        )
+    if not good:
+        raise RecordingError(
+            recording.path or recording.name,
+            f"an IMU whose gaps leave no part of {len(bad)} that can be estimated",
+            "half a second without a gap in which the tool is seen",
+            "a better recording, or the model loose_rate",
+        )
+    return good
 
 
 def describe(made: Estimate, recording: Recording, diagnosis: Diagnosis) -> dict[str, Any]:
@@ -73,6 +115,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 @model_option
 @robust_option
 @noise_option
+@sort_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("result"), show_default=True
 )
@@ -117,6 +160,7 @@ def estimate(
     model: str,
     means: Means | None,
     noise_files: tuple[str, ...],
+    sort: bool,
     output: Path,
     online: bool,
     smooth: bool,
@@ -140,25 +184,31 @@ def estimate(
         )
     chosen = get_model(model) if means is None else robust(model, means)
     params = parameters.load(chosen, *noise_files)
-    recordings = load_runs(runs)
+    recordings = load_runs(runs, sort=sort, model=chosen)
+    if isinstance(requested, list):
+        requested = [_inside(requested[runs.index(r.path or r.name)], r) for r in recordings]
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
     if online:
-        estimates = [estimate_online(recording, chosen, params) for recording in recordings]
+        made_of = (estimate_online(recording, chosen, params) for recording in recordings)
     else:
-        estimates = estimate_many(recordings, chosen, params, smooth=smooth, at=requested)
-    summaries = []
-    for made, recording in zip(estimates, recordings, strict=True):
-        diagnosis = diagnose(made, recording)
-        folder = made.save(
-            output / recording.name,
-            overwrite=overwrite,
-            exports=exports,
-            diagnosis=diagnosis.as_dict(curves=True),
-        )
-        summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+        made_of = iter(estimate_many(recordings, chosen, params, smooth=smooth, at=requested))
+    estimates, summaries = [], []
+    # One after the other as far as can be: what is finished is on the disk should the next one be stopped.
+    for recording in recordings:
+        with memory.for_runs([recording.name]):
+            made = next(made_of)
+            diagnosis = diagnose(made, recording)
+            folder = made.save(
+                output / recording.name,
+                overwrite=overwrite,
+                exports=exports,
+                diagnosis=diagnosis.as_dict(curves=True),
+            )
+            summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+        estimates.append(made)
         warn(made, diagnosis)
-        note(f"wrote {folder}")
+        wrote(folder)
     document = {"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries}
     if len(recordings) > 1:
         pooled = diagnose_many(estimates, recordings)
@@ -192,6 +242,15 @@ def _requested(
         return None if distance is None else every(distance)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
+
+
+def _inside(asked: Requested | Every | None, recording: Recording) -> Any:
+    """Of what was asked for of a run, what lies in one of its parts; None for nothing."""
+    if "part" not in recording.info or not isinstance(asked, np.ndarray):
+        return asked
+    time = recording.need_imu().time_ns
+    chosen = asked[(asked >= time[0]) & (asked <= time[-1])]
+    return chosen if chosen.size else None
 
 
 def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:

@@ -12,6 +12,8 @@ from jaxekf.cli.console import (
     note,
     print_json,
     robust_option,
+    sort_option,
+    wrote,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.errors import ModelError
@@ -53,6 +55,7 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
 @model_option
 @robust_option
 @noise_option
+@sort_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), default=Path("figures"), show_default=True
 )
@@ -63,6 +66,7 @@ def plot(
     model: str,
     means: Means | None,
     noise_files: tuple[str, ...],
+    sort: bool,
     output: Path,
     as_json: bool,
 ) -> None:
@@ -73,15 +77,16 @@ def plot(
     hidden) and innovations.
     """
     chosen = get_model(model) if means is None else robust(model, means)
-    recordings = load_runs(runs)
+    recordings = load_runs(runs, sort=sort, model=chosen)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
     for made, recording in zip(estimates, recordings, strict=True):
         names = figures or plots.possible_figures(made, recording)
         if not names:
             note(f"{made.run}: no figure: it needs samples of a tracker and ten instants or more")
-        files += draw(made, recording, output, names)
-    for file in files:
-        note(f"wrote {file}")
+        drawn = draw(made, recording, output, names)
+        files += drawn
+        for file in drawn:
+            wrote(file)
     if as_json:
         print_json({"figures": [str(file) for file in files]})

@@ -8,7 +8,7 @@ from click.core import ParameterSource
 
 from jaxekf import files, simulate_tool, storage
 from jaxekf import simulate as simulator
-from jaxekf.cli.console import json_option, note, overwrite_option, print_json
+from jaxekf.cli.console import json_option, overwrite_option, print_json, wrote
 from jaxekf.cli.options import Finite, Span, hidden, spans
 from jaxekf.recording import Recording
 
@@ -149,7 +149,7 @@ def simulate(
         recording = record(motion, number, options)
         folder = output / recording.name
         written.append(str(storage.save(recording, folder, overwrite=overwrite, digits=10)))
-        note(f"wrote {written[-1]}")
+        wrote(folder)
     if as_json:
         print_json({"runs": written})
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import tuning
-from jaxekf import parameters
+from jaxekf import memory, parameters
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import (
     json_option,
@@ -18,7 +18,9 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    sort_option,
     tuning_progress,
+    wrote,
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.cli.folds import (
@@ -51,6 +53,7 @@ from tuning.ways import OPTIMISERS
 )
 @model_option
 @noise_option
+@sort_option
 @click.option(
     "--objective",
     default="attitude",
@@ -160,6 +163,7 @@ def tune(
     validate: tuple[Path, ...],
     model: str,
     noise_files: tuple[str, ...],
+    sort: bool,
     objective: str,
     free: tuple[str, ...],
     own: tuple[str, ...],
@@ -193,8 +197,9 @@ def tune(
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
-    training, judging = load_runs(runs), load_runs(validate)
     aim = parse(objective)
+    training = load_runs(runs, sort=sort, model=chosen)
+    judging = load_runs(validate, sort=sort, model=chosen)
     asked = [*free, *(read_free(spec) if spec else ())]
     asked += [tuning.Free(name, each_run=True) for name in own]
     for run in training + judging if aim.needs_truth else ():
@@ -225,7 +230,7 @@ def tune(
         unseen = held_out(training, folds, **asked_beside, **options)
         if not as_json:
             print_folds(unseen)
-    with tuning_progress(iterations) as progress:
+    with memory.for_runs([run.name for run in training]), tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuned.save(output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
@@ -241,16 +246,22 @@ def tune(
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
+    _print(tuned, rows, "validation runs" if judging else "the training runs")
+
+
+def _print(tuned: tuning.Tuned, rows: list[tuning.Row], judged: str) -> None:
+    """The tables of a tuning."""
     _print_noise(tuned)
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        print_comparison(f"On {'validation runs' if judging else 'the training runs'}", rows)
+        print_comparison(f"On {judged}", rows)
 
 
 def _note(tuned: tuning.Tuned, output: Path) -> None:
     """Where it is, how it ended, and what to know of it."""
-    note(f"wrote {output / 'noise.toml'}: {tuned.stopped}, best at iteration {tuned.best.number}")
+    wrote(output / "noise.toml")
+    note(f"{tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
     for label, more in tuned.open.items():

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxekf import intake
 from jaxekf.errors import RecordingError
-from jaxekf.recording import NANOSECONDS, Imu, Recording
+from jaxekf.recording import NANOSECONDS, Recording
+from jaxekf.rows import Place
 
 _G = 9.80665
 
@@ -36,5 +38,13 @@ def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
             "another file",
         )
     time_ns = np.round(np.arange(len(data)) * (NANOSECONDS / sampling_hz)).astype(np.int64)
-    imu = Imu(time_ns, np.deg2rad(data[:, :3]), _G * data[:, 3:])
-    return Recording(file.stem, imu=imu, info={"sampling_rate_hz": sampling_hz}, path=file)
+    imu, account = intake.imu(Place(file), time_ns, np.deg2rad(data[:, :3]), _G * data[:, 3:])
+    info = {
+        "sampling_rate_hz": sampling_hz,
+        "assumptions": [
+            "Columns are the gyroscope about x, y, z in deg/s and the accelerometer along x, y, z in g"
+            f" ({_G} m/s^2), in the IMU's frame.",
+            f"Samples are evenly spaced at {sampling_hz:g} Hz: the file has no times.",
+        ],
+    }
+    return Recording(file.stem, imu=imu, info=info, path=file, intake={"imu": account})

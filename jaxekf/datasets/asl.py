@@ -9,6 +9,7 @@ w, x, y, z unless the header says another.
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from jaxekf import intake
 from jaxekf.datasets.columns import (
     Columns,
     Sheet,
@@ -27,7 +29,8 @@ from jaxekf.datasets.columns import (
 )
 from jaxekf.errors import RecordingError
 from jaxekf.pose import gravity
-from jaxekf.recording import Floats, Imu, Optical, Recording, from_scipy, to_scipy, unit_quaternions
+from jaxekf.recording import Floats, Imu, Optical, Recording, Times, from_scipy, to_scipy
+from jaxekf.rows import Intake, Place, Reason
 
 _RATE_AND_FORCE = ("wx", "wy", "wz", "ax", "ay", "az")
 _POSE = ("px", "py", "pz", "qw", "qx", "qy", "qz")
@@ -147,7 +150,8 @@ def load(
 
     Rates are rad/s and specific forces m/s^2, both (N, 3) in I. A pose is not valid where its
     quaternion is zero or not near unit norm, or where any of its numbers is missing. Rows repeated
-    exactly are dropped. `info` says what was read: ``imu_stream``, ``pose_stream``, ``pose_kind``
+    exactly are dropped, and a last line that is cut short. `intake` holds the account of both streams,
+    by lines of their files. `info` says what was read: ``imu_stream``, ``pose_stream``, ``pose_kind``
     (measured, estimate or unknown), ``duplicate_rows`` dropped, ``imu_noise`` where ``sensor.yaml``
     has it (rad/s/√Hz, rad/s²/√Hz, m/s²/√Hz, m/s³/√Hz), ``gravity_ref`` (approximate, m/s²) and, in
     sentences, all ``assumptions``.
@@ -161,12 +165,15 @@ def load(
     inertial, tracked = _read(imu_stream, _RATE_AND_FORCE), _read(pose_stream, _POSE)
     # A flat pair is known by its prefix, however it was given.
     unnamed = place is None or place == imu_stream.file.parent
+    optical, seen = _optical(tracked, inertial.body_sensor.inverse().then(tracked.body_sensor))
+    read, felt = _imu(inertial)
     recording = Recording(
         _name(imu_stream.file if place is None or unnamed else place),
-        optical=_optical(tracked, inertial.body_sensor.inverse().then(tracked.body_sensor)),
-        imu=_imu(inertial),
+        optical=optical,
+        imu=read,
         info=_info(inertial, tracked),
         path=place or imu_stream.file,
+        intake={"optical": seen, "imu": felt},
     )
     _check_gravity(recording, pose_stream)
     return recording
@@ -430,27 +437,46 @@ def _read(stream: _Stream, wanted: Sequence[str]) -> _Source:
     return _Source(stream, about, _extrinsics(stream, about), sheet, locate(sheet, wanted))
 
 
-def _imu(source: _Source) -> Imu:
+def _imu(source: _Source) -> tuple[Imu, Intake]:
     values = numbers(source.sheet, source.columns)
     check_finite(source.sheet, source.columns, values)
-    return Imu(stamps(source.sheet), values[:, :3].copy(), values[:, 3:].copy())
+    time_ns = stamps(source.sheet)
+    gyroscope, accelerometer = values[:, :3].copy(), values[:, 3:].copy()
+    imu, account = intake.imu(_place(source), time_ns, gyroscope, accelerometer)
+    return imu, _with_left_out(account, source, time_ns)
 
 
-def _optical(source: _Source, body_sensor: _Transform) -> Optical:
+def _optical(source: _Source, body_sensor: _Transform) -> tuple[Optical, Intake]:
     """The body's attitude and the tracked point's position, given the tracked frame in the body."""
     values = numbers(source.sheet, source.columns)
-    position = values[:, :3].copy()
-    q_ref_sensor, valid = unit_quaternions(values[:, 3:])
-    valid &= np.isfinite(position).all(axis=1)
-    q_ref_body = from_scipy(to_scipy(q_ref_sensor) * body_sensor.rotation.inv())
-    q_ref_body[~valid] = (1.0, 0.0, 0.0, 0.0)
-    return Optical(
-        stamps(source.sheet),
-        q_ref_body,
-        valid,
-        position,
+    time_ns = stamps(source.sheet)
+    sensor, account = intake.optical(
+        _place(source),
+        time_ns,
+        values[:, 3:],
+        values[:, :3].copy(),
         p_body_tool=body_sensor.translation.copy(),
     )
+    q_ref_body = from_scipy(to_scipy(sensor.q_ref_body) * body_sensor.rotation.inv())
+    q_ref_body[~sensor.valid] = (1.0, 0.0, 0.0, 0.0)
+    return replace(sensor, q_ref_body=q_ref_body), _with_left_out(account, source, time_ns)
+
+
+def _place(source: _Source) -> Place:
+    return Place(source.sheet.path, np.array(source.sheet.lines, np.intp))
+
+
+def _with_left_out(account: Intake, source: _Source, time_ns: Times) -> Intake:
+    """The account with the lines that the sheet left out: exact duplicates wherever they stood, and a last
+    line that is cut short, which has the stamp of the row before it."""
+    dropped = dict(account.dropped)
+    if source.sheet.repeated:
+        lines, rows = np.array(source.sheet.repeated, np.intp).T
+        dropped["repeated"] = Reason(lines, time_ns[rows])
+    if source.sheet.cut:
+        dropped["cut short"] = Reason(np.array(source.sheet.cut, np.intp), time_ns[-1:])
+    count = len(source.sheet.repeated) + len(source.sheet.cut)
+    return replace(account, rows=account.rows + count, dropped=dropped)
 
 
 def _info(imu: _Source, pose: _Source) -> dict[str, Any]:
@@ -459,7 +485,7 @@ def _info(imu: _Source, pose: _Source) -> dict[str, Any]:
         "imu_stream": imu.stream.label,
         "pose_stream": pose.stream.label,
         "pose_kind": pose.stream.kind,
-        "duplicate_rows": {"imu": imu.sheet.duplicates, "optical": pose.sheet.duplicates},
+        "duplicate_rows": {"imu": len(imu.sheet.repeated), "optical": len(pose.sheet.repeated)},
         "gravity_ref": list(_GRAVITY_REF),
         "assumptions": list(_assumptions(imu, pose)),
     }

@@ -13,19 +13,22 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
+from jaxekf import intake
 from jaxekf.errors import RecordingError
-from jaxekf.recording import (
-    NANOSECONDS,
-    Encoder,
-    Imu,
-    Optical,
-    Recording,
-    from_scipy,
-    to_scipy,
-    unit_quaternions,
-)
+from jaxekf.recording import NANOSECONDS, Optical, Recording, from_scipy, to_scipy
+from jaxekf.rows import Place
 
 _NEEDED = ("imu_gyr", "imu_acc", "opt_quat", "movement", "sampling_rate")
+_ASSUMPTIONS = (
+    "The body is the frame of the IMU; the markers' frame is taken to be the same (off by 0.1 to 0.5 deg).",
+    "opt_quat is a unit quaternion w, x, y, z (Hamilton) that turns the body's coordinates into the"
+    " reference's, which is east, north, up.",
+    "The encoder is the optical attitude again: truth for a tracker made of it (broad.degrade),"
+    " not for itself.",
+    "Samples are evenly spaced at sampling_rate; IMU and motion capture share one clock.",
+    "Units are rad/s, m/s^2, µT and m.",
+    "gravity_ref is not set: it is found from the accelerometer.",
+)
 
 
 def find(folder: Path | str, trial: int | str) -> Path:
@@ -45,31 +48,40 @@ def find(folder: Path | str, trial: int | str) -> Path:
 def load(path: Path | str) -> Recording:
     """One trial: IMU, optical attitude and position, and the optical attitude again as truth.
 
-    Truth is valid where `opt_quat` is not NaN and scored where `movement` is set.
+    Truth is valid where `opt_quat` is not NaN and scored where `movement` is set. `intake` holds the
+    account of every stream, by samples.
     """
     path = Path(path)
     data = _read(path)
     rate = float(np.squeeze(data["sampling_rate"]))
     count = len(data["imu_gyr"])
     time_ns = np.round(np.arange(count) * (NANOSECONDS / rate)).astype(np.int64)
-    quaternion, valid = unit_quaternions(np.asarray(data["opt_quat"], float))
-    scored = np.asarray(data["movement"]).reshape(-1).astype(bool) & valid
-    position = data.get("opt_pos")
-    magnetometer = data.get("imu_mag")
+    place, quaternion = Place(path), np.asarray(data["opt_quat"], float)
+    movement = np.asarray(data["movement"]).reshape(-1).astype(bool)
+    position, magnetometer = (
+        np.asarray(data[name], float) if name in data else None for name in ("opt_pos", "imu_mag")
+    )
+    optical, seen = intake.optical(place, time_ns, quaternion, position)
+    imu, felt = intake.imu(
+        place,
+        time_ns,
+        np.asarray(data["imu_gyr"], float),
+        np.asarray(data["imu_acc"], float),
+        magnetometer,
+    )
+    encoder, true = intake.encoder(place, time_ns, quaternion, scored=movement)
     return Recording(
         name=path.stem,
-        optical=Optical(
-            time_ns, quaternion, valid, None if position is None else np.asarray(position, float)
-        ),
-        imu=Imu(
-            time_ns,
-            np.asarray(data["imu_gyr"], float),
-            np.asarray(data["imu_acc"], float),
-            None if magnetometer is None else np.asarray(magnetometer, float),
-        ),
-        encoder=Encoder(time_ns, quaternion, valid, scored),
-        info={"dataset": "BROAD", "sampling_rate_hz": rate},
+        optical=optical,
+        imu=imu,
+        encoder=encoder,
+        info={
+            "dataset": "BROAD",
+            "sampling_rate_hz": rate,
+            "assumptions": list(_ASSUMPTIONS),
+        },
         path=path,
+        intake={"optical": seen, "imu": felt, "encoder": true},
     )
 
 

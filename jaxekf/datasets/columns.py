@@ -44,7 +44,10 @@ class Sheet(NamedTuple):
     """A comma, or None for white space."""
     width: int
     """Cells in every row."""
-    duplicates: int
+    repeated: list[tuple[int, int]]
+    """Line of each exact duplicate, and the place in `rows` of what it repeats."""
+    cut: list[int]
+    """The file's last line where it ends too early: it is not among the rows."""
 
 
 class Columns(NamedTuple):
@@ -58,7 +61,10 @@ class Columns(NamedTuple):
 
 
 def read_sheet(path: Path) -> Sheet:
-    """The rows of a file. Raises `RecordingError` where it is unreadable, empty or ragged."""
+    """The rows of a file, without a last one that is cut short.
+
+    Raises `RecordingError` where it is unreadable, empty or ragged.
+    """
     if not path.is_file():
         raise RecordingError(path, "no such file", "a file of samples", "another path")
     try:
@@ -69,21 +75,31 @@ def read_sheet(path: Path) -> Sheet:
         ) from error
     headers: list[tuple[int, str]] = []
     first: dict[str, int] = {}
-    count = 0
+    places: dict[str, int] = {}
+    repeated: list[tuple[int, int]] = []
+    latest = 0
     for number, line in enumerate(text.splitlines(), start=1):
         row = line.strip()
         if not row:
             continue
+        latest = number
         if row[0] == "#" or (not first and row[:4].lower() == "time"):
             headers.append((number, row))
             continue
-        first.setdefault(row, number)
-        count += 1
+        if row in first:
+            repeated.append((number, places[row]))
+        else:
+            places[row] = len(first)
+            first[row] = number
     if not first:
         raise RecordingError(path, "0 samples", "at least one", "exporting the recording again")
-    rows = list(first)
+    rows, cut = list(first), []
     separator = "," if "," in rows[0] else None
     width = _cells(rows[0], separator)
+    last = rows[-1]
+    if len(rows) > 1 and first[last] == latest and _cells(last, separator) < width:
+        cut.append(first.pop(last))
+        rows.pop()
     for row, number in first.items():
         if _cells(row, separator) != width:
             raise RecordingError(
@@ -93,7 +109,7 @@ def read_sheet(path: Path) -> Sheet:
                 "completing the row or removing it",
                 line=number,
             )
-    return Sheet(path, rows, list(first.values()), headers, separator, width, count - len(first))
+    return Sheet(path, rows, list(first.values()), headers, separator, width, repeated, cut)
 
 
 def _cells(row: str, separator: str | None) -> int:

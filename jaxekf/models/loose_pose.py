@@ -81,7 +81,8 @@ def _source(recording: Recording) -> Samples:
     seen = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
     value = Pose(np.where(seen[:, None], position, 0.0), optical.q_ref_body)
     error = np.zeros(len(seen)) if optical.error is None else np.nan_to_num(optical.error)
-    return Samples(optical.time_ns - optical.latency_ns, value, seen, error, optical.latency_ns)
+    taken = optical.time_ns - optical.latency_ns
+    return Samples(taken, value, seen, error, optical.latency_ns, ("optical",))
 
 
 def _setup(recording: Recording) -> Setup:

@@ -17,7 +17,8 @@ def optical_attitude(recording: Recording) -> Samples:
         )
     optical = recording.need_optical()
     taken = optical.time_ns - optical.latency_ns
-    return Samples(taken, optical.q_ref_body, optical.valid, latency_ns=optical.latency_ns)
+    late = optical.latency_ns
+    return Samples(taken, optical.q_ref_body, optical.valid, latency_ns=late, origin=("optical",))
 
 
 def single_markers(recording: Recording) -> Markers:
@@ -35,7 +36,8 @@ def single_markers(recording: Recording) -> Markers:
 def gyroscope(recording: Recording) -> Samples:
     """The gyroscope's rate (N, 3), rad/s, body frame."""
     imu = recording.need_imu()
-    return Samples(imu.time_ns, imu.gyroscope, np.ones(len(imu.time_ns), bool))
+    every = np.ones(len(imu.time_ns), bool)
+    return Samples(imu.time_ns, imu.gyroscope, every, origin=("imu",))
 
 
 def imu(recording: Recording) -> Samples:
@@ -49,7 +51,8 @@ def imu(recording: Recording) -> Samples:
             "adding ax,ay,az to imu.csv, or the model loose",
         )
     both = np.concatenate([stream.gyroscope, stream.accelerometer], axis=1)
-    return Samples(stream.time_ns, both, np.asarray(np.isfinite(both).all(axis=1)))
+    finite = np.asarray(np.isfinite(both).all(axis=1))
+    return Samples(stream.time_ns, both, finite, origin=("imu",))
 
 
 def tracked_position(optical: Optical, recording: Recording) -> Floats:

@@ -79,7 +79,7 @@ def _source(name: str, recording: Recording) -> Samples:
     usable = markers.usable[:, at]
     error = np.zeros(count) if markers.error is None else np.nan_to_num(markers.error[:, at])
     position = np.where(usable[:, None], markers.position[:, at], 0.0)
-    return Samples(taken, position, usable, error, markers.latency_ns)
+    return Samples(taken, position, usable, error, markers.latency_ns, ("markers", name))
 
 
 def _setup(names: tuple[str, ...], recording: Recording) -> Setup:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from jaxekf.files import whole_file
 from jaxekf.recording import Floats
 
 ESTIMATE, MEASURED, TRUTH, HELD = "#0b5394", "#e69138", "#222222", "#a61c00"
@@ -78,8 +79,8 @@ def finish(figure: Figure, grid: Any, title: str) -> None:
 
 
 def save(figure: Figure, file: Path | str) -> Path:
-    """Write a figure as PNG."""
+    """Write a figure as PNG, whole or not at all; an earlier one is replaced."""
     FigureCanvasAgg(figure)
-    with styled():
-        figure.savefig(file)
+    with styled(), whole_file(file, overwrite=True) as made:
+        figure.savefig(made)
     return Path(file)

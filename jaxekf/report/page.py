@@ -27,6 +27,8 @@ from jaxekf.report.tunings import TuningSection, tuning_markup, tunings_overview
 
 MARKER = 'content="jaxekf report"'
 """By which a report is known from other HTML files."""
+_DIGITS = 12
+"""Of a hash: the whole of it is in the result."""
 
 
 class Section(NamedTuple):
@@ -187,6 +189,11 @@ def _settings(seen: Evidence) -> str:
 def _provenance(seen: Evidence) -> str:
     document = seen.result.document
     provenance: Mapping[str, Any] = document["provenance"]
-    entries = [(key, value) for key, value in provenance.items() if key != "versions"]
+    entries = [
+        (key, value) for key, value in provenance.items() if key not in ("versions", "inputs")
+    ]
+    if isinstance(files := provenance.get("inputs"), Mapping):
+        told = (f"{name} {str(digest)[:_DIGITS]}" for name, digest in files.items())
+        entries.append(("inputs, SHA-256", ", ".join(told) or "–"))
     entries.append(("log-likelihood", shown(document.get("log_likelihood"), 1)))
     return origin_markup(entries, provenance.get("versions"))

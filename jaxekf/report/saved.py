@@ -206,6 +206,9 @@ def _read_arrays(file: Path) -> dict[str, Any]:
     missing = [name for name in ("time_ns", "cov", "labels") if name not in arrays]
     if missing:
         raise RecordingError(file, f"no {', '.join(missing)}", "them", _AGAIN)
+    if arrays.get("schema_version") != SCHEMA_VERSION:
+        got = f"schema_version {arrays.get('schema_version')}"
+        raise RecordingError(file, got, f"{SCHEMA_VERSION}", _AGAIN)
     return arrays
 
 
@@ -258,6 +261,9 @@ def _read_settings(folder: Path) -> tuple[Setting, ...]:
             raise RecordingError(
                 file, f"text that is not TOML ({error})", "TOML", _AGAIN
             ) from error
+        if document.get("schema_version") != SCHEMA_VERSION:
+            got = f"schema_version {document.get('schema_version')!r}"
+            raise RecordingError(file, got, f"{SCHEMA_VERSION}", _AGAIN)
         for section in ("noise", "initial", "calibration"):
             for name, entry in document.get(section, {}).items():
                 found.append(Setting(section, name, entry.get("value"), entry.get("unit", "")))

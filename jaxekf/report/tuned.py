@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,7 +95,25 @@ def read_tuning(folder: Path | str) -> SavedTuning:
             "what jaxekf tune writes there",
             _AGAIN,
         )
+    _check_noise(Path(folder), document.get("tuning"))
     return SavedTuning(Path(folder), document)
+
+
+def _check_noise(folder: Path, tuning: Any) -> None:
+    """What a kill left of two tunings is not shown as one."""
+    file = folder / "noise.toml"
+    try:
+        origin = tomllib.loads(file.read_text("utf-8-sig")).get("origin")
+    except (OSError, ValueError):
+        return
+    beside = origin.get("tuning") if isinstance(origin, dict) else None
+    if None not in (beside, tuning) and beside != tuning:
+        raise RecordingError(
+            folder / FILE,
+            f"the record of the tuning {tuning} beside {file.name} of {beside}",
+            "both of one, which a kill while they were written may have prevented",
+            "tuning again",
+        )
 
 
 def _refuse(constant: str) -> None:

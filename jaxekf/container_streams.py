@@ -1,0 +1,137 @@
+"""Arrays of a file as streams of a recording, their rows judged as those of any source are."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxekf import description, intake
+from jaxekf.recording import Encoder, Imu, Markers, Optical
+from jaxekf.rows import Intake, Part, Place
+
+
+def optical(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Optical, Intake]:
+    arm = group.get("p_body_tool")
+    if arm is not None:
+        arm = description.finite_vector(arm, 3, place.path, "p_body_tool")
+    return intake.optical(
+        place,
+        group["time_ns"],
+        group["q_ref_body"],
+        group.get("position"),
+        error=_reported(place, group, "error", least=0.0),
+        hidden=~group["valid"] if "valid" in group else None,
+        sort=sort,
+        p_body_tool=arm,
+        latency_ns=int(group.get("latency_ns", 0)),
+    )
+
+
+def imu(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Imu, Intake]:
+    streams = [group.get(key) for key in ("accelerometer", "magnetometer")]
+    return intake.imu(place, group["time_ns"], group["gyroscope"], *streams, sort=sort)
+
+
+def encoder(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Encoder, Intake]:
+    return intake.encoder(
+        place,
+        group["time_ns"],
+        group["q_ref_body"],
+        group.get("position"),
+        scored=group.get("scored"),
+        hidden=~group["valid"] if "valid" in group else None,
+        sort=sort,
+    )
+
+
+def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers, Intake]:
+    """The frames; of the account each marker in each frame is a row, by the number of its frame."""
+    time, position, names = group["time_ns"], group["position"], group["names"]
+    _check_names(place, names)
+    for i, point in enumerate(group["p_body_marker"]):
+        description.finite_vector(point, 3, place.path, f"p_body_marker[{i}]")
+    said = group.get("visible", np.ones(position.shape[:2], bool))
+    rows = [position, said] + [group[key] for key in ("quality", "error") if key in group]
+    order, account = intake.in_order(place, time, rows, sort=sort)
+    intake.check_rate(place, time[order])
+    kept, count = place.take(order), len(names)
+    each = np.repeat(np.arange(len(order)), count)
+    finite = np.isfinite(position[order]).all(axis=2)
+    reasons = {"hidden": ~said[order].reshape(-1), "position not finite": ~finite.reshape(-1)}
+    repeated = {
+        reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
+        for reason, r in account.dropped.items()
+    }
+    again = [r.time_ns for r in account.dropped.values()]
+    parts = {name: Part(len(time), np.concatenate([*again, time[:0]]), time[:0]) for name in names}
+    account = replace(account, rows=len(time) * count, dropped=repeated, parts=parts)
+    seen, account = intake.mask_first(kept.take(each), time[order][each], account, reasons)
+    reported = {
+        key: values if values is None else values[order]
+        for key, values in (
+            ("quality", _reported(place, group, "quality")),
+            ("error", _reported(place, group, "error", least=0.0)),
+        )
+    }
+    return Markers(
+        time[order],
+        position[order],
+        seen.reshape(finite.shape),
+        names,
+        group["p_body_marker"],
+        quality_min=description.finite_number(
+            float(group.get("quality_min", 0.0)), place.path, "quality_min"
+        ),
+        latency_ns=int(group.get("latency_ns", 0)),
+        **reported,
+    ), account
+
+
+def _check_names(place: Place, names: tuple[str, ...]) -> None:
+    """Each marker has a name of its own, such as a CSV file can hold."""
+    for i, name in enumerate(names):
+        if not name or name != name.strip() or not name.isprintable() or name in names[:i]:
+            raise place.error(
+                i,
+                "names",
+                repr(name),
+                "printable names, without blanks at their ends, each once",
+                "renaming the marker",
+            )
+    if not names:
+        raise place.error(None, None, "no marker", "at least one", "naming them in names")
+
+
+def _reported(place: Place, group: Mapping[str, Any], key: str, least: float = -np.inf) -> Any:
+    """A tracker's own figures: finite and not below `least`, or NaN where it reported none."""
+    values = group.get(key)
+    if values is not None and (bad := np.argwhere(np.isinf(values) | (values < least))).size:
+        at = tuple(bad[0])
+        expected = "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more"
+        hint = "writing NaN, which means that none was reported"
+        raise place.error(int(at[0]), key, f"{values[at]}", expected, hint)
+    return values
+
+
+def as_stored(stream: Any, group: Mapping[str, Any]) -> Any:
+    """With the numbers that `save` wrote, where reading has scaled them or put others in hidden rows.
+
+    A pose that was judged when the run was first read is not judged again: its last bits are kept.
+    """
+    if len(stream.time_ns) != len(group["time_ns"]):
+        return stream
+    kept: dict[str, Any] = {}
+    if "q_ref_body" in group:
+        stored = group["q_ref_body"]
+        with np.errstate(invalid="ignore", over="ignore"):
+            near = np.abs(np.linalg.norm(stored, axis=1) - 1.0) <= intake.NORM_ROUNDED
+        as_it_is = near | ~group["valid"] if "valid" in group else near
+        kept["q_ref_body"] = np.where(as_it_is[:, None], stored, stream.q_ref_body)
+    if "scored" in group:
+        kept["scored"] = group["scored"]
+    return replace(stream, **kept)
+
+
+MAKERS = {"optical": optical, "markers": markers, "imu": imu, "encoder": encoder}
+"""Of a place, arrays by name and whether to sort: a stream, and what became of its rows."""

@@ -19,7 +19,7 @@ _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
 _FARTHEST_M = 20.0
 _STANDARD = 9.80665
 _SEEN_TOO_LITTLE = 0.5
-_EXPECTED = ("blank", "missing tool", "status ")
+_EXPECTED = ("blank", "hidden", "missing tool", "status ")
 """What begins so is masked in good recordings, too: the tool was hidden."""
 
 Span = tuple[float, float]

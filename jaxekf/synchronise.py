@@ -28,6 +28,7 @@ _CORRELATED = 8
 _LARGEST_SIGMA_S = 0.005
 _BLOCK_S, _LOCAL = 0.2, 20
 """Seconds over which rates are compared, and blocks whose mean is taken off."""
+_SURE = 1.0 - 1e-9
 _BY_CHANCE = 8.0
 """Deviations that a correlation of noise does not reach, with lag and frame fitted to it."""
 
@@ -123,12 +124,14 @@ def _need_changes(optical: Optical, imu: Imu, found: Match, place: object) -> No
     shared = float(np.sum(one * other))
     squares = float(np.sum(one**2) * np.sum(other**2))
     likeness = shared / np.sqrt(squares) if squares > 0.0 else 0.0
-    if likeness * np.sqrt(one.size) < _BY_CHANCE:
+    # Fisher's transform: of few blocks, too, a correlation near one is none of chance.
+    deviations = np.arctanh(np.clip(likeness, -_SURE, _SURE)) * np.sqrt(max(one.size - 3, 1))
+    if deviations < _BY_CHANCE:
         raise RecordingError(
             str(place),
             "so little turning faster and slower that tracker and gyroscope are alike by chance only"
             f" (correlation {likeness:.2f})",
-            f"{min(1.0, _BY_CHANCE / np.sqrt(max(one.size, 1))):.2f} or more",
+            f"{np.tanh(_BY_CHANCE / np.sqrt(max(one.size - 3, 1))):.2f} or more",
             "a recording in which the tool turns about several axes, faster and slower",
         )
 

@@ -48,6 +48,8 @@ def test_verdicts_and_exit_status(tmp_path):
     wrong = free(2)
     imu = replace(wrong.imu, gyroscope=np.rad2deg(wrong.imu.gyroscope))
     wrong = storage.save(wrong.replace(imu=imu), tmp_path / "wrong")
+    occluded = storage.save(free(0, occlusions=[(3.0, 5.0)]), tmp_path / "fine.h5")
+    assert run_check(occluded).exit_code == 0
     done = run_check(fine)
     assert done.exit_code == 0, done.output
     assert "free-0: fine" in done.stdout and "62.500" in done.stdout

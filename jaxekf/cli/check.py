@@ -9,7 +9,15 @@ import click
 
 from jaxekf import storage
 from jaxekf.cli.align import aligned_row, alignment_columns, run_document
-from jaxekf.cli.console import json_option, note, overwrite_option, print_json, print_table
+from jaxekf.cli.console import (
+    json_option,
+    note,
+    overwrite_option,
+    print_json,
+    print_table,
+    sort_option,
+)
+from jaxekf.description import SCHEMA_VERSION
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import Evidence
 from jaxekf.files import check_output, finite_or_null, whole_folder
@@ -44,9 +52,12 @@ class Checked(NamedTuple):
     type=click.Path(path_type=Path),
     help="A folder for check.json and a picture of each run's time axis, check_NAME.png.",
 )
+@sort_option
 @overwrite_option
 @json_option
-def check(runs: tuple[Path, ...], output: Path | None, overwrite: bool, as_json: bool) -> None:
+def check(
+    runs: tuple[Path, ...], output: Path | None, sort: bool, overwrite: bool, as_json: bool
+) -> None:
     """Samples, gaps, masked rows, clocks, frames and units of RUNS, and whether to trust them.
 
     Gaps are steps of more than 1.5 times the median; lost is the sum of these. Clock and frame are those
@@ -55,10 +66,15 @@ def check(runs: tuple[Path, ...], output: Path | None, overwrite: bool, as_json:
     """
     if output is not None:
         check_output(output, "check.json", overwrite=overwrite)
-    checked = [_check(path) for path in runs]
+    checked = [_check(path, sort=sort) for path in runs]
     verdicts = {one.verdict for one in checked}
     worst = next(v for v in ("faults", "warnings", "fine") if v in verdicts)
-    document = {"verdict": worst, "runs": [_document(one) for one in checked]}
+    document = {
+        "schema_version": SCHEMA_VERSION,
+        "kind": "jaxekf check",
+        "verdict": worst,
+        "runs": [_document(one) for one in checked],
+    }
     if output is not None:
         with whole_folder(output, "check.json", overwrite=overwrite) as folder:
             text = json.dumps(finite_or_null(document), indent=2)
@@ -75,9 +91,9 @@ def check(runs: tuple[Path, ...], output: Path | None, overwrite: bool, as_json:
         click.get_current_context().exit(STATUS[worst])
 
 
-def _check(path: Path) -> Checked:
+def _check(path: Path, *, sort: bool) -> Checked:
     try:
-        recording = storage.load(path)
+        recording = storage.load(path, sort=sort)
     except (RecordingError, OSError) as error:
         return Checked(path, None, None, str(error))
     return Checked(path, recording, inspect(recording), None)

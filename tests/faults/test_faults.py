@@ -430,7 +430,9 @@ def test_22_other_units(folder):
     np.testing.assert_allclose(run.imu.gyroscope, before.imu.gyroscope, rtol=1e-14)
 
 
-@pytest.mark.parametrize(("factor", "word"), [(1.0 / 9.81, "rad/s, g"), (0.0, "gravity is removed")])
+@pytest.mark.parametrize(
+    ("factor", "word"), [(1.0 / 9.81, "rad/s, g"), (0.0, "gravity is removed")]
+)
 def test_23_accelerations(folder, factor, word):
     """Would catch 1 g taken for 1 m/s^2, and gravity that is not there."""
     column(folder / "imu.csv", ["ax", "ay", "az"], lambda v: factor * v)

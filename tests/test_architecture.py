@@ -16,11 +16,7 @@ ORDER = [
     ("rows", "optional", "memory"),
     ("rotation", "linalg", "recording", "temporary"),
     ("files",),
-<<<<<<< HEAD
     ("densities", "rest", "intake", "text", "container_guard", "likeness"),
-=======
-    ("densities", "rest", "intake", "likeness", "text", "container_guard"),
->>>>>>> 292dfc7f4cf560b355e01999fb6bab29c8240a7c
     ("allan",),
     ("manifold", "tables", "truth", "description", "streams", "gaps"),
     ("stated", "hashes"),
@@ -33,12 +29,8 @@ ORDER = [
         "container_files",
         "container_streams",
     ),
-<<<<<<< HEAD
-    ("containers", "alignment", "plausible"),
-=======
     ("containers",),
     ("alignment", "plausible"),
->>>>>>> 292dfc7f4cf560b355e01999fb6bab29c8240a7c
     ("inspection",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs"),

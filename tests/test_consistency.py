@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenario
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
@@ -104,7 +105,7 @@ def monte_carlo(model, params, steps, keys):
     return innovations, healthy, ends(output.instants.updated), ends(found.smoothed)
 
 
-@pytest.mark.parametrize("name", ["loose", "loose_rate"])
+@pytest.mark.parametrize("name", scenario.long_form(["loose", "loose_rate"], {"loose_rate"}))
 def test_errors_and_innovations_are_as_large_as_their_covariances(name):
     """Would catch a wrong F, G, Q, R or reset, noise that depends on the sampling rate, and a smoother
     that promises more, or gains less, than the samples after an instant give."""

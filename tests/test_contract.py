@@ -270,9 +270,10 @@ def test_partly_masked_run(model):
     assert np.all(trace[seen] < before[seen])
 
 
-@every_model
-def test_gradients(model):
+@pytest.mark.parametrize("name", scenario.long_form(list(MODELS), {"loose_pose", "markers"}))
+def test_gradients(name):
     """A NaN under differentiation, with data, without and at rest; a parameter that is cut off."""
+    model = MODELS[name]
     params = parameters(model)
     given, rest = data(model, 0), data(model, 0, rest=True)
     usual, _ = evaluate(model, params, given.mean, given.flat)

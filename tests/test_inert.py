@@ -83,7 +83,7 @@ def assert_close(actual, expected):
     jax.tree.map(close, actual, expected)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", scenario.long_form(NAMES, {"loose_rate"}))
 def test_padding_is_inert(name):
     """Padding that moves the state, adds noise or likelihood, or sends NaN back through dt = 0."""
     _, params, first, steps, truth = prepared(name)

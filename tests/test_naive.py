@@ -48,7 +48,8 @@ def weighted(found, seed):
 
 
 @pytest.mark.parametrize(
-    "name", scenario.long_form(list(MODELS), {"loose_pose", "loose_rate", "markers"})
+    "name",
+    scenario.long_form(list(MODELS), {"loose_pose", "loose_rate", "markers", "visual", "triad"}),
 )
 def test_fast_is_naive(name):
     """Structure found that is not there, a block of rows taken wrongly, a cotangent lost: by a fast path

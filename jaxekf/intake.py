@@ -82,7 +82,7 @@ def optical(
     unit, lost, notes = judge_quaternions(place, np.where(ignored[:, None], np.nan, quaternion))
     reasons |= lost
     if position is not None:
-        reasons["position not finite"] = ~np.isfinite(position).all(axis=1)
+        reasons["position not finite"] = ~whole(position)
     if error is not None:
         with np.errstate(invalid="ignore"):
             reasons[f"fit error over {error_max:g} m"] = error > error_max
@@ -120,7 +120,7 @@ def imu(
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
     needed = [a[order] for a in (gyroscope, accelerometer) if a is not None]
-    bad = ~np.isfinite(np.concatenate(needed, axis=1)).all(axis=1)
+    bad = ~whole(np.concatenate(needed, axis=1))
     valid, account = mask_first(place, time_ns, account, {"not finite": bad})
     if not valid.any():
         raise place.error(
@@ -256,6 +256,11 @@ def mask_first(
     return valid, replace(intake, masked=masked)
 
 
+def whole(values: Floats) -> Flags:
+    """Rows (N,) of values (N, c) that are finite."""
+    return np.asarray(np.isfinite(values).all(axis=1))
+
+
 def judge_quaternions(
     place: Place, values: Floats, *, column: str = "qw"
 ) -> tuple[Floats, dict[str, Flags], tuple[str, ...]]:
@@ -264,8 +269,7 @@ def judge_quaternions(
     What is missing (blank, not finite, zero, or of a norm that no rounding explains) becomes the identity.
     Raises `RecordingError` where more than 5 % of the rows are of such a norm: these are no quaternions.
     """
-    blank = np.isnan(values).all(axis=1)
-    lost = ~np.isfinite(values).all(axis=1)
+    blank, lost = np.asarray(np.isnan(values).all(axis=1)), ~whole(values)
     # Scaled first, so that no square overflows.
     size = np.max(np.abs(np.where(lost[:, None], 0.0, values)), axis=1, initial=0.0)
     safe = np.where(size > 0.0, size, 1.0)

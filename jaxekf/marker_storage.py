@@ -98,7 +98,8 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
 
 def _account(place: Place, times: Times, position: Floats, account: Intake) -> Intake:
     """With the lines of hidden markers masked."""
-    _, account = intake.mask_first(place, times, account, {"blank": np.isnan(position).all(axis=1)})
+    blank = np.asarray(np.isnan(position).all(axis=1))
+    _, account = intake.mask_first(place, times, account, {"blank": blank})
     return account
 
 

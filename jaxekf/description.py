@@ -16,6 +16,7 @@ SCHEMA_VERSION = 1
 FILE = "recording.toml"
 BODY_TO_REFERENCE = "w,x,y,z, body to reference"
 _MENDING = f"correcting {FILE}"
+_LONGEST_LATENCY_S = 3600.0
 
 
 def read_description(folder: Path) -> dict[str, Any]:
@@ -146,10 +147,14 @@ def latency_ns(about: Mapping[str, Any], label: str, place: Path | str) -> int:
     """The `latency` of a stream, seconds in the file, to the nanosecond; 0 where none is stated."""
     value = about.get("latency", 0.0)
     seconds = _number(value)
-    if seconds is None or seconds < 0.0:
+    if seconds is None or not 0.0 <= seconds <= _LONGEST_LATENCY_S:
         key = f"{label}.latency"
         raise RecordingError(
-            place, f"{key} = {value!r}", "finite seconds, 0 or more", _MENDING, column=key
+            place,
+            f"{key} = {value!r}",
+            f"finite seconds, 0 or more, {_LONGEST_LATENCY_S:g} at most",
+            _MENDING,
+            column=key,
         )
     return round(seconds * NANOSECONDS)
 

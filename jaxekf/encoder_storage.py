@@ -23,7 +23,6 @@ from jaxekf.tables import (
     QUATERNION,
     Sheet,
     Table,
-    finite_numbers,
     flags,
     need_columns,
     numbers,
@@ -50,7 +49,10 @@ def read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     if "angle" in table.columns:
         (scale,) = stated.factors("joint", about, place)
         length = 1.0
-        q = joint_attitude(scale * finite_numbers(table, ("angle",))[:, 0], about, place)
+        angle = scale * numbers(table, ("angle",), blank=True)[:, 0]
+        known = np.isfinite(angle)
+        q = joint_attitude(np.where(known, angle, 0.0), about, place)
+        q[~known] = np.nan
     else:
         _, length = stated.factors("encoder", about, place)
         turning = stated.turning("encoder", about, place)

@@ -49,6 +49,15 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
             name=f"{recording.name}-part{k + 1}", info={**recording.info, "part": about}
         )
         (good if _can_be_estimated(part) else bad).append(part)
+    if good and bad:
+        left = "; ".join(
+            f"{part.name} is left out ("
+            + ", ".join(f"{account.rows} rows of {label}" for label, account in part.intake.items())
+            + ")"
+            for part in bad
+        )
+        first = good[0]
+        good[0] = first.replace(info={**first.info, "part": f"{first.info['part']}; {left}"})
     return good, bad
 
 

@@ -18,10 +18,13 @@ from jaxekf.rows import Indices, Intake, Place, Reason
 MOST_BAD_NORMS = 0.05
 """Share of rows with a norm that is no quaternion's, over which the columns are something else."""
 NORM_ROUNDED, NORM_WRONG = 1e-3, 0.1
-SLOWEST_S = 0.5
+SLOWEST_S, SLOWEST_TRACKER_S = 0.5, 1.5
 """Median step from which on a stream is taken for one whose times are in another unit."""
-_RESTING = 0.05
-"""rad/s: what a gyroscope of a resting tool tells at most, its bias included."""
+FASTEST_S = 2e-5
+_BEYOND = 1e6
+"""SI: what no sensor reads, such as the huge numbers that stand for a lost tool."""
+_RESTING, _TURNED, _STILL = 0.05, 0.04, 0.02
+"""rad/s and rad that a gyroscope of a resting tool tells at most, and rad/s below which a tool rests."""
 STATUS_OK = ("ok", "0")
 """Words of a status that mean a good sample, unless others are stated; in lower case."""
 NDI_STATUS = {
@@ -59,9 +62,11 @@ def optical(
     `judge_quaternions` do.
     """
     numbers = [a for a in (quaternion, position, error, hidden) if a is not None]
+    if status is not None:
+        numbers.append(np.unique(np.asarray(status, str), return_inverse=True)[1].astype(float))
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
-    check_rate(place, time_ns)
+    check_rate(place, time_ns, SLOWEST_TRACKER_S)
     quaternion = quaternion[order]
     position = None if position is None else position[order]
     error = None if error is None else error[order]
@@ -83,6 +88,7 @@ def optical(
     reasons |= lost
     if position is not None:
         reasons["position not finite"] = ~whole(position)
+        reasons["position beyond any tracker"] = huge(position)
     if error is not None:
         with np.errstate(invalid="ignore"):
             reasons[f"fit error over {error_max:g} m"] = error > error_max
@@ -96,7 +102,10 @@ def optical(
             "at least one",
             "a run in which the tool is seen, or stating the status words that are good (status_ok)",
         )
-    account = replace(account, notes=(*account.notes, *notes))
+    coarse = rounded(quaternion[valid])
+    account = replace(
+        account, notes=(*account.notes, *notes), has_status=status is not None, rounded=coarse
+    )
     return Optical(time_ns, unit, valid, position, error=error, **said), account
 
 
@@ -121,7 +130,10 @@ def imu(
     check_rate(place, time_ns)
     needed = [a[order] for a in (gyroscope, accelerometer) if a is not None]
     bad = ~whole(np.concatenate(needed, axis=1))
-    valid, account = mask_first(place, time_ns, account, {"not finite": bad})
+    far = huge(np.concatenate(needed, axis=1))
+    valid, account = mask_first(
+        place, time_ns, account, {"not finite": bad, "beyond any sensor": far}
+    )
     if not valid.any():
         raise place.error(
             None, None, f"no finite row among {account.rows}", "at least one", "recording again"
@@ -160,6 +172,14 @@ def encoder(
     seen = np.where(hidden[:, None], np.nan, quaternion[order])
     unit, lost, notes = judge_quaternions(place, seen)
     valid, account = mask_first(place, time_ns, account, {"hidden": hidden} | lost)
+    if not valid.any():
+        raise place.error(
+            None,
+            None,
+            f"no usable row among {account.rows}",
+            "at least one",
+            "leaving the stream out where there is no truth",
+        )
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
     return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
@@ -256,6 +276,12 @@ def mask_first(
     return valid, replace(intake, masked=masked)
 
 
+def huge(values: Floats) -> Flags:
+    """Rows (N,) of values (N, c) of which some are beyond what is measured."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(values) > _BEYOND).any(axis=1))
+
+
 def whole(values: Floats) -> Flags:
     """Rows (N,) of values (N, c) that are finite."""
     return np.asarray(np.isfinite(values).all(axis=1))
@@ -312,12 +338,20 @@ def judge_quaternions(
     return unit, reasons, notes
 
 
-def check_rate(place: Place, time_ns: Times) -> None:
+def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> None:
     """Raise `RecordingError` where the rate that the times imply is that of another unit."""
     if len(time_ns) < 3:
         return
     step = float(np.median(np.diff(time_ns))) * 1e-9
-    if step < SLOWEST_S:
+    if 0.0 < step < FASTEST_S:
+        raise place.error(
+            None,
+            "time",
+            f"a sample every {step:.3g} s",
+            f"a rate of {1e-3 / FASTEST_S:g} kHz at most",
+            'stating the unit of its times: time_unit = "s", or "ms"',
+        )
+    if step < slowest_s:
         return
     for unit, factor in (("ms", 1e3), ("µs", 1e6), ("ns", 1e9)):
         rate = factor / step
@@ -326,7 +360,7 @@ def check_rate(place: Place, time_ns: Times) -> None:
                 None,
                 "time",
                 f"a sample every {step:.6g} s",
-                f"a rate of more than {1.0 / SLOWEST_S:g} Hz (in {unit} it would be {rate:.4g} Hz)",
+                f"a rate of more than {1.0 / slowest_s:.2g} Hz (in {unit} it would be {rate:.4g} Hz)",
                 f'stating the unit of its times: time_unit = "{unit}"',
             )
 
@@ -335,12 +369,19 @@ def _seconds(time_ns: int) -> str:
     return f"{int(time_ns) / 1e9:.9f}".rstrip("0").rstrip(".")
 
 
+def rounded(values: Floats) -> bool:
+    """Whether numbers were exported with so few decimals that a resting tool may repeat them."""
+    finite = values[np.isfinite(values)]
+    scaled = 1e4 * finite[np.abs(finite) < 1e6]
+    return bool(np.all(np.abs(scaled - np.round(scaled)) < 1e-6)) if scaled.size else False
+
+
 def without_repeats(recording: Recording) -> Recording:
     """A run in which poses that a tracker repeats to the last bit are masked: so looks a lost tool.
 
-    Where the gyroscope turns meanwhile the pose is frozen, and masked whatever the status says; where it
-    rests a tracker that rounds may repeat itself, and is believed. Without an IMU or a status to tell,
-    repeats are masked as suspicious, and so is the identity at the origin from its first row on.
+    Where the gyroscope turns meanwhile the pose is frozen, whatever the status says. Where it does not, a
+    status that is good is believed, and so are numbers of four decimals or fewer, which repeat of
+    themselves; other repeats are suspicious, and the identity at the origin from its first row on.
     """
     stream, account = recording.optical, recording.intake.get("optical")
     if stream is None or account is None:
@@ -352,30 +393,20 @@ def without_repeats(recording: Recording) -> Recording:
     again = (pose[1:] == pose[:-1]).all(axis=1)
     if not again.any():
         return recording
-    # From the first to the last row of one pose.
-    first = np.maximum.accumulate(
-        np.where(np.concatenate([[True], ~again]), np.arange(len(seen)), 0)
-    )
     repeated = np.concatenate([[False], again])
-    moves, told = np.zeros(len(seen), bool), recording.imu is not None
-    if recording.imu is not None:
-        begin = stream.time_ns[seen[first]] - stream.latency_ns
-        end = stream.time_ns[seen] - stream.latency_ns
-        moves = _turns(recording.imu, begin, end)
+    first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(seen))))
+    frozen = repeated & _turned(recording, seen, first)
     home = np.zeros(pose.shape[1])
     home[0] = 1.0
     lost = (pose == home).all(axis=1) & (stream.position is not None)
     lost &= repeated | np.concatenate([again, [False]])
-    names = {
-        "frozen while the IMU moves": repeated & moves,
-        "suspicious (identity at the origin, repeated)": lost & (not told),
-        "suspicious (pose repeated exactly)": repeated & (not told),
-    }
-    if told:
-        # The first row of such a pose is no better than those that follow.
-        gone = np.zeros(len(seen), bool)
-        gone[first[lost & repeated & moves]] = True
-        names["frozen while the IMU moves"] |= gone
+    # The first row of a pose that lasts while the tool turns is good; that of a lost tool is not.
+    frozen[first[frozen & lost]] = True
+    names = {"frozen while the IMU moves": frozen}
+    if not account.has_status:
+        names["suspicious (identity at the origin, repeated)"] = lost
+        if not account.rounded:
+            names["suspicious (pose repeated exactly)"] = repeated
     place = Place(recording.path or recording.name, account.numbers)
     bad = np.zeros(len(seen), bool)
     for name, which in names.items():
@@ -396,10 +427,34 @@ def without_repeats(recording: Recording) -> Recording:
     )
 
 
-def _turns(imu: Imu, begin: Times, end: Times) -> Flags:
-    """Whether the gyroscope tells a turn from one time to another (N,): whatever its bias."""
-    low = np.clip(np.searchsorted(imu.time_ns, begin), 0, len(imu.time_ns) - 1)
-    high = np.clip(np.searchsorted(imu.time_ns, end, side="right"), low + 1, len(imu.time_ns))
-    rate = np.linalg.norm(imu.gyroscope, axis=1)
-    total = np.concatenate([[0.0], np.cumsum(rate)])
-    return (total[high] - total[low]) / (high - low) > _RESTING
+def _turned(recording: Recording, seen: Indices, first: Indices) -> Flags:
+    """Whether the gyroscope turns by more than its noise since the first row of the same pose (n,)."""
+    stream, imu = recording.optical, recording.imu
+    assert stream is not None
+    if imu is None:
+        return np.zeros(len(seen), bool)
+    taken = stream.time_ns[seen] - stream.latency_ns
+    rate = imu.gyroscope - _resting_rate(stream, imu, seen, first, taken)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(rate, axis=0)])
+    low = np.clip(np.searchsorted(imu.time_ns, taken[first]), 0, len(imu.time_ns) - 1)
+    high = np.clip(np.searchsorted(imu.time_ns, taken, side="right"), low + 1, len(imu.time_ns))
+    lasts = (taken - taken[first]) * 1e-9
+    mean = np.linalg.norm((total[high] - total[low]) / (high - low)[:, None], axis=1)
+    return (mean > _RESTING) | (mean * lasts > _TURNED)
+
+
+def _resting_rate(stream: Optical, imu: Imu, seen: Indices, first: Indices, taken: Times) -> Floats:
+    """What the gyroscope reads while the tracker says that the tool rests: its bias; else 0."""
+    step = max(1, int(np.searchsorted(taken, taken[0] + 500_000_000)))
+    a, b = stream.q_ref_body[seen[:-step]], stream.q_ref_body[seen[step:]]
+    if not len(a):
+        return np.zeros(3)
+    angle = 2.0 * np.arccos(np.clip(np.abs(np.sum(a * b, axis=1)), 0.0, 1.0))
+    span = (taken[step:] - taken[:-step]) * 1e-9
+    # A pose that is the same for long is what is in doubt.
+    new = first == np.arange(len(first))
+    still = (angle < _STILL * span) & new[:-step] & new[step:] & (span < 2.0)
+    if still.sum() < 10:
+        return np.zeros(3)
+    at = np.clip(np.searchsorted(imu.time_ns, taken[:-step][still]), 0, len(imu.time_ns) - 1)
+    return np.median(imu.gyroscope[at], axis=0)

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 
 from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Floats, Markers, Times
+from jaxekf.recording import Flags, Floats, Markers, Times
 from jaxekf.rows import Intake, Part, Place
 from jaxekf.tables import (
     POSITION,
     Sheet,
     Table,
     need_columns,
+    numbers,
     reported,
     stamps,
-    whole_or_blank,
     words,
 )
 
@@ -48,7 +48,8 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     about, place = source.about, source.place
     (length,) = stated.factors("markers", about, place)
     names, p_body_marker = _geometry(about.get("geometry"), place)
-    position, error = length * whole_or_blank(table, POSITION), reported(table, "error", least=0.0)
+    position = length * numbers(table, POSITION, blank=True)
+    error = reported(table, "error", least=0.0)
     error = None if error is None else length * error
     quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
     columns = [a for a in (position, quality, error) if a is not None]
@@ -78,7 +79,9 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
         )
         for m, name in enumerate(names)
     }
-    account = replace(_account(place_of_kept, times, position[order], account), parts=parts)
+    seen, account = _judged(place_of_kept, times, position[order], marker, account)
+    account = replace(account, parts=parts)
+    position[order[~seen]] = np.nan
     position = by_frame(position)
     stream = Markers(
         times[first],
@@ -96,11 +99,35 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     return stream, account
 
 
-def _account(place: Place, times: Times, position: Floats, account: Intake) -> Intake:
-    """With the lines of hidden markers masked."""
-    blank = np.asarray(np.isnan(position).all(axis=1))
-    _, account = intake.mask_first(place, times, account, {"blank": blank})
-    return account
+def _judged(
+    place: Place, times: Times, position: Floats, marker: Indices, account: Intake
+) -> tuple[Flags, Intake]:
+    """Which lines are of a marker that is seen; the others are masked, by reason."""
+    blank, finite = np.asarray(np.isnan(position).all(axis=1)), intake.whole(position)
+    order = np.lexsort((times, marker))
+    there = position[order]
+    again = np.zeros(len(position), bool)
+    same = (there[1:] == there[:-1]).all(axis=1) & (np.diff(marker[order]) == 0)
+    again[order[1:][same]] = True
+    reasons = {
+        "blank": blank,
+        "not finite": ~finite,
+        "missing marker (zeros)": finite & np.asarray((position == 0.0).all(axis=1)),
+        "beyond any tracker": intake.huge(position),
+    }
+    if not intake.rounded(position[finite]):
+        reasons["suspicious (position repeated exactly)"] = again
+    seen, account = intake.mask_first(place, times, account, reasons)
+    if not seen.any():
+        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
+        raise place.error(
+            None,
+            None,
+            f"no usable line among {account.rows} ({told})",
+            "at least one",
+            "a run in which markers are seen",
+        )
+    return seen, account
 
 
 def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:

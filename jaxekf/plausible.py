@@ -45,6 +45,7 @@ def check(recording: Recording, found: Evidence) -> None:
     """As `require`, with the evidence at hand."""
     if found.overlap_s < 0.0:
         raise _apart(recording, found)
+    _check_truth(recording)
     force = _force(recording, found)
     rate = None
     if found.rate > _LEAST_RATE and found.rate_correlation > ALIKE:
@@ -82,13 +83,14 @@ def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] 
     expected = f"about {gravity:.3g} m/s^2"
     if norm >= _REMOVED_BELOW and found.static_scatter > _STEADY:
         # Never at rest: what is left besides motion is told by the tracker's attitudes.
-        norm = found.mean_force if norm < 0.2 * gravity else np.nan
+        far = norm < 0.2 * gravity or norm > 3.0 * gravity
+        norm = found.mean_force if far else np.nan
         got = f"an accelerometer whose readings average {norm:.2g} m/s^2 in the tracker's frame"
     if norm < _REMOVED_BELOW:
         hint = "recording with gravity in it, or leaving out the columns ax, ay, az"
         error = _fault(recording, "imu.unit", got, f"{expected}: gravity is removed", hint)
         return "m/s^2", error
-    for unit, size in (("g", 1.0), ("m/s^2", _STANDARD**2)):
+    for unit, size in (("g", 1.0), ("m/s^2", _STANDARD**2), ("mm/s^2", 1e3 * _STANDARD)):
         if abs(norm / size - 1.0) < _G_WITHIN:
             hint = f'[imu] unit = "rad/s, {unit}"'
             return unit, _fault(recording, "imu.unit", got, expected, hint)
@@ -154,7 +156,7 @@ def _check_order(recording: Recording, found: Evidence) -> None:
         f"quaternions of which, as '{about}', the gyroscope explains"
         f" {100.0 * found.explained:.0f} % of the turning",
         f"more; read otherwise it explains {100.0 * fits[names[0]].share:.0f} %",
-        f"[optical] {entries}{also}",
+        f"[optical] {entries}{also}; where a header names the columns, naming them as they are",
     )
 
 
@@ -169,6 +171,26 @@ def _apart(recording: Recording, found: Evidence) -> RecordingError:
         " and ".join(words),
         "streams that overlap in time",
         "putting both on one clock, or the IMU's log of the same run",
+    )
+
+
+def _check_truth(recording: Recording) -> None:
+    """Truth of another time than what it is the truth of."""
+    truth = recording.encoder
+    others = [s for s in (recording.optical, recording.markers, recording.imu) if s is not None]
+    if truth is None or not others:
+        return
+    first = min(int(stream.time_ns[0]) for stream in others)
+    last = max(int(stream.time_ns[-1]) for stream in others)
+    if truth.time_ns[0] <= last and truth.time_ns[-1] >= first:
+        return
+    ends = (truth.time_ns[0], truth.time_ns[-1], first, last)
+    a, b, c, d = (_seconds(1e-9 * t) for t in ends)
+    raise RecordingError(
+        recording.path or recording.name,
+        f"encoder from {a} to {b} s and the other streams from {c} to {d} s",
+        "streams that overlap in time",
+        "putting them on one clock, or stating the unit of its times (time_unit)",
     )
 
 

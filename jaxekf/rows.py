@@ -89,6 +89,10 @@ class Intake:
     numbers: Indices | None = None
     """(N,) line or sample of each sample of the stream, which may be fewer than rows."""
 
+    has_status: bool = False
+    """Whether the source says of each row whether it is good."""
+    rounded: bool = False
+    """Whether its numbers have so few decimals that a resting tool may repeat them."""
     parts: Mapping[str, Part] = field(default_factory=dict)
     """Of each marker, by its name."""
 

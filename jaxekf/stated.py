@@ -11,6 +11,7 @@
 """
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,10 +19,42 @@ import numpy as np
 
 from jaxekf.description import BODY_TO_REFERENCE, FILE
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Floats
+from jaxekf.recording import STREAMS, Floats
 from jaxekf.tables import QUATERNION, TIME_UNITS, Layout
 from jaxekf.text import DELIMITERS
 
+RUN_KEYS = (
+    *STREAMS,
+    "schema_version",
+    "name",
+    "sha256",
+    "trust_units",
+    "gravity_ref",
+    "p_body_object",
+    "q_body_object",
+)
+SECTION_KEYS = (
+    "kind",
+    "frame",
+    "unit",
+    "quaternion",
+    "file",
+    "columns",
+    "skip_lines",
+    "delimiter",
+    "time_unit",
+    "latency",
+    "status_ok",
+    "error_max",
+    "p_body_tool",
+    "quality_min",
+    "geometry",
+    "axis",
+    "acts_on",
+    "q_zero",
+    "q_optical_encoder",
+    "p_optical_encoder",
+)
 HELD = ("file", "columns", "skip_lines", "delimiter", "time_unit")
 """Entries that are of no more use once a file is read."""
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -58,6 +91,22 @@ class Turning(NamedTuple):
     def standard(self, values: Floats) -> Floats:
         """Numbers (N, 4), w, x, y, z, as from body to reference."""
         return values * np.array([1.0, -1.0, -1.0, -1.0]) if self.inverse else values
+
+
+def check_keys(entries: Mapping[str, Any], label: str, place: Path | str) -> None:
+    """Raise `RecordingError` for an entry that is nearly one that means something; others are facts."""
+    known = SECTION_KEYS if label else RUN_KEYS
+    for key in entries:
+        near = [] if key in known else get_close_matches(key, known, 1, 0.8)
+        if near:
+            head = f"{label}." if label else ""
+            raise RecordingError(
+                place,
+                f"{head}{key}",
+                f"{head}{near[0]}",
+                "correcting the name, or another one for a fact of your own",
+                column=f"{head}{key}",
+            )
 
 
 def layout(label: str, about: Mapping[str, Any], place: Path | str) -> Layout:
@@ -118,6 +167,8 @@ def turning(label: str, about: Mapping[str, Any], place: Path | str) -> Turning:
     """Order and direction of a stream's quaternions, ``quaternion = "w,x,y,z, body to reference"``."""
     value = about.get("quaternion", BODY_TO_REFERENCE)
     parts = [part.strip() for part in value.split(",")] if isinstance(value, str) else []
+    if parts in ([d] for d in _DIRECTIONS):
+        parts = [*"wxyz", *parts]
     order, direction = tuple(parts[:4]), parts[4:] or [_DIRECTIONS[0]]
     if sorted(order) != ["w", "x", "y", "z"] or direction not in ([d] for d in _DIRECTIONS):
         expected = f"'{BODY_TO_REFERENCE}', or another order, or 'reference to body'"

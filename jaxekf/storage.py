@@ -77,6 +77,15 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
 def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / description.FILE
+    stated.check_keys(about, "", place)
+    if not isinstance(about.get("trust_units", False), bool):
+        raise RecordingError(
+            place,
+            f"trust_units = {about['trust_units']!r}",
+            "true or false",
+            "correcting it",
+            column="trust_units",
+        )
     hashes = _hashes(about, place)
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
@@ -84,6 +93,7 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     for label, form in _FORMS.items():
         section = about.get(label, {})
         description.check_section(place, label, section, form.described)
+        stated.check_keys(section, label, place)
         how = stated.layout(label, section, place)
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
@@ -113,6 +123,14 @@ def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
             "correcting or removing it",
             column="sha256",
         )
+    for name in said:
+        if not (place.parent / name).is_file():
+            raise RecordingError(
+                place,
+                f"a hash of {name}, which is not there",
+                "one of each file",
+                "correcting its name",
+            )
     return said
 
 

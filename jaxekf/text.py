@@ -7,6 +7,7 @@ brought to the same form: commas, decimal points, line feeds, as many cells in e
 import csv
 import hashlib
 import io
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,9 @@ _ENCODINGS = {
 }
 DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
 _MOST_COLUMNS = 2000
+_DECIMAL = re.compile(r"\s*[+-]?\d*[.,]?\d+([eE][+-]?\d+)?\s*")
+_BROKEN_OFF = re.compile(rb"[+-]?(\d*\.?\d*[eE][+-]?|[.]?)|[+-]")
+"""What a number may be when a file ends in the middle of it, and is none."""
 
 
 class Text(NamedTuple):
@@ -80,7 +84,10 @@ def read_text(
     """
     raw = _read(path)
     digest = hashlib.sha256(raw).hexdigest()
+    ended = raw.endswith((b"\n", b"\r"))
     raw = _lines(path, raw)
+    if not ended:
+        raw = _without_half_a_number(raw)
     number = 1
     for _ in range(skip_lines):
         end = raw.find(b"\n")
@@ -110,13 +117,13 @@ def read_text(
 
 
 def _read(path: Path) -> bytes:
-    if path.is_dir():
-        raise RecordingError(path, "a folder", "a file", "naming the file in it")
-    if not path.exists():
-        raise RecordingError(
-            path, "no such file", "the stream named in recording.toml", "adding it"
-        )
     try:
+        if path.is_dir():
+            raise RecordingError(path, "a folder", "a file", "naming the file in it")
+        if not path.exists():
+            raise RecordingError(
+                path, "no such file", "the stream named in recording.toml", "adding it"
+            )
         raw = path.read_bytes()
     except OSError as error:
         raise RecordingError(
@@ -155,6 +162,15 @@ def _lines(path: Path, raw: bytes) -> bytes:
     return raw if raw.endswith(b"\n") else raw + b"\n"
 
 
+def _without_half_a_number(raw: bytes) -> bytes:
+    """The same without a last cell that ends within a number, so that its line counts as cut short."""
+    at = max(raw.rfind(b",", 0, -1), raw.rfind(b";", 0, -1), raw.rfind(b"\t", 0, -1))
+    last = raw[at + 1 : -1].strip()
+    if at > raw.rfind(b"\n", 0, -1) and last and _BROKEN_OFF.fullmatch(last):
+        return raw[:at] + b"\n"
+    return raw
+
+
 def _encoding(path: Path, name: str) -> RecordingError:
     return RecordingError(path, name, "UTF-8", "saving as UTF-8")
 
@@ -180,7 +196,14 @@ def _delimited(
         return raw, ()
     notes = [f"cells are separated by {DELIMITERS[delimiter]}s"]
     if b'"' in raw:
-        rows = csv.reader(io.StringIO(raw.decode("utf-8")), delimiter=delimiter)
+        rows = list(csv.reader(io.StringIO(raw.decode("utf-8")), delimiter=delimiter))
+        cells = [cell for row in rows[1:] for cell in row if _DECIMAL.fullmatch(cell)]
+        if any("," in cell for cell in cells) and not any("." in cell for cell in cells):
+            rows[1:] = [
+                [c.replace(",", ".") if _DECIMAL.fullmatch(c) else c for c in row]
+                for row in rows[1:]
+            ]
+            notes.append("numbers have decimal commas")
         out = io.StringIO()
         csv.writer(out, lineterminator="\n").writerows(rows)
         return out.getvalue().encode(), tuple(notes)

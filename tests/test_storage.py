@@ -112,11 +112,6 @@ CASES = {
         "increase",
         4,
     ),
-    "NaN in the gyroscope": (
-        lambda f: edit(f / "encoder.csv", ".131456789,0", ".131456789,nan"),
-        "finite",
-        3,
-    ),
     "empty file": (lambda f: (f / "imu.csv").write_text(""), "empty", None),
     "header only": (lambda f: (f / "imu.csv").write_text("time,gx,gy,gz\n"), "0 samples", None),
     "no axis": (lambda f: edit(f / "recording.toml", "axis =", "axes ="), "axis = [x, y, z]", None),

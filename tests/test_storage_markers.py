@@ -187,6 +187,8 @@ def test_latency_is_exact(folder, seconds, expected):
     """Would catch a latency cut off instead of rounded: 0.016600009 * 1e9 lies below 16600009."""
     entry("markers.latency", seconds)(folder)
     entry("optical.latency", seconds)(folder)
+    # So late that the tracker and the IMU of this short run do not meet.
+    entry("trust_units", True)(folder)
     run = jaxekf.load(folder)
     assert (run.need_markers().latency_ns, run.need_optical().latency_ns) == (expected, expected)
 
@@ -332,12 +334,6 @@ FAULTS = {
         ["times that do not decrease"],
         (5, "time"),
     ),
-    "half a position": (
-        set_cell("markers", 6, "y", ""),
-        ["markers.csv", "3 blank cells"],
-        (8, "x,y,z"),
-    ),
-    "infinite position": (set_cell("markers", 6, "y", "inf"), ["inf", "finite"], (8, "x,y,z")),
     "text position": (set_cell("markers", 6, "y", "abc"), ["'abc'", "a number"], (8, "y")),
     "infinite quality": (set_cell("markers", 6, "quality", "inf"), ["finite"], (8, "quality")),
     "negative error": (
@@ -530,3 +526,39 @@ def test_nothing_is_saved_that_could_not_be_read_again(tmp_path, run, words):
     with pytest.raises(RecordingError, match=words):
         jaxekf.save(run(), tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"y": ""}, "not finite"),
+        ({"y": "inf"}, "not finite"),
+        ({"x": "0", "y": "0", "z": "0"}, "missing marker (zeros)"),
+        ({"x": "-3.697314e28"}, "beyond any tracker"),
+    ],
+)
+def test_markers_that_are_none_are_masked(folder, change, reason):
+    """Would catch half a position, or a place that stands for a lost marker, taken for one."""
+    before = jaxekf.load(folder).markers.visible
+    for name, text in change.items():
+        set_cell("markers", 6, name, text)(folder)
+    run = jaxekf.load(folder)
+    assert run.intake["markers"].masked[reason].numbers.tolist() == [8]
+    assert before.sum() - run.markers.visible.sum() == 1
+
+
+def test_markers_that_stand_still_to_the_last_bit(folder):
+    """Would catch markers frozen where they were last seen."""
+    lines = (folder / "markers.csv").read_text().splitlines()
+    cells = [line.split(",") for line in lines[1:]]
+    name = cells[0][1]
+    at = [i for i, row in enumerate(cells) if row[1] == name and row[2]][:3]
+    # With four decimals or fewer a resting marker repeats itself.
+    cells[at[0]][2:5] = ["0.123456789", "0.2", "0.3"]
+    for i in at[1:]:
+        cells[i][2:5] = cells[at[0]][2:5]
+    (folder / "markers.csv").write_text("\n".join([lines[0], *map(",".join, cells)]) + "\n")
+    masked = jaxekf.load(folder).intake["markers"].masked
+    assert masked["suspicious (position repeated exactly)"].numbers.tolist() == [
+        i + 2 for i in at[1:]
+    ]

@@ -587,3 +587,88 @@ def test_an_export_is_described_not_rewritten(folder):
     np.testing.assert_allclose(run.optical.q_ref_body[seen], optical.q_ref_body[seen], atol=1e-11)
     result = call("estimate", folder, "-o", folder.parent / "own")
     assert result.exit_code == 0, result.output
+
+
+def test_a_lost_tool_at_rest(folder):
+    """Would catch the origin, or the last pose, believed because the gyroscope is quiet meanwhile."""
+    column(folder / "imu.csv", ["gx", "gy", "gz"], lambda v: 1e-5 * v)
+    lines = lines_of(folder / "optical.csv")
+    rng = np.random.default_rng(0)
+    q = np.roll(
+        Rotation.from_rotvec([0.5, 0.3, 0.1] + 1e-3 * rng.normal(size=(len(lines), 3))).as_quat(),
+        1,
+        axis=1,
+    )
+    for i in range(1, len(lines)):
+        pose = (
+            "1,0,0,0,0,0,0"
+            if 60 <= i < 90
+            else ",".join(f"{v:.9g}" for v in [*q[i], 0.1, 0.2, 0.3])
+        )
+        lines[i] = f"{lines[i].split(',')[0]},{pose}"
+    write(folder / "optical.csv", lines)
+    found = plain(folder).intake["optical"].masked
+    assert found["suspicious (identity at the origin, repeated)"].count == 30
+    # An export of four decimals repeats itself while the tool rests, and is believed.
+    for i in range(1, len(lines)):
+        time = lines[i].split(",")[0]
+        lines[i] = f"{time},{','.join(f'{v:.4f}' for v in q[1])},0.1000,0.2000,0.3000"
+    write(folder / "optical.csv", lines)
+    assert not plain(folder).intake["optical"].masked
+
+
+def test_a_slow_freeze(folder):
+    """Would catch a pose frozen for seconds while the tool turns slowly: 2 deg/s are 20 deg in ten."""
+    imu = plain(folder).need_imu()
+    slow = np.deg2rad([2.0, 0.0, 0.0])
+    column(folder / "imu.csv", ["gx", "gy", "gz"], lambda v: np.broadcast_to(slow, v.shape))
+    lines = lines_of(folder / "optical.csv")
+    start = 1e-9 * imu.time_ns[0]
+    for i in range(1, len(lines)):
+        time = lines[i].split(",")[0]
+        turned = Rotation.from_rotvec((min(float(time) - start, 1.0)) * slow).as_quat()
+        pose = [*np.roll(turned, 1), 0.1, 0.2, 0.3]
+        lines[i] = ",".join([time, *(f"{v:.17g}" for v in pose), "OK"])
+    write(folder / "optical.csv", [lines[0] + ",status", *lines[1:]])
+    found = plain(folder).intake["optical"].masked["frozen while the IMU moves"]
+    assert found.count > 40
+
+
+@pytest.mark.parametrize("ending", ["-", "1.5e-", "0.", "+"])
+def test_a_last_line_that_ends_within_a_number(folder, ending):
+    """Would catch half a number read as one, or refused as text."""
+    lines = lines_of(folder / "imu.csv")
+    cells = lines[-1].split(",")
+    (folder / "imu.csv").write_text("\n".join([*lines[:-1], ",".join([*cells[:-1], ending])]))
+    run = plain(folder)
+    if ending != "0.":
+        assert run.intake["imu"].masked["cut short"].numbers.tolist() == [len(lines)]
+
+
+@pytest.mark.parametrize(
+    ("section", "entry", "words"),
+    [
+        ("optical", "latencey = 0.01", ["optical.latencey", "optical.latency"]),
+        ("imu", 'time_units = "ms"', ["imu.time_units", "imu.time_unit"]),
+        ("imu", "latency = 0.0\n[optcal]", ["optcal", "optical"]),
+        ("imu", "skip_lines = 0\n[sha256]\n'imu.cvs' = 'aa'", ["imu.cvs", "not there"]),
+        ("optical", "latency = 1e300", ["3600 at most"]),
+    ],
+)
+def test_entries_that_would_be_ignored(folder, section, entry, words):
+    """Would catch a misspelt entry that changes nothing and says nothing."""
+    file = folder / "recording.toml"
+    head, tail = file.read_text().split(f"[{section}]\n")
+    own, *others = tail.split("\n[", 1)
+    file.write_text("\n[".join([f"{head}[{section}]\n{own.rstrip()}\n{entry}\n", *others]))
+    refused(folder, *words)
+
+
+def test_a_status_decides_between_rows_of_one_time(folder):
+    """Would catch a row that is called missing dropped as a repeat of one that is OK."""
+    lines = [
+        line + (",status" if i == 0 else ",OK")
+        for i, line in enumerate(lines_of(folder / "optical.csv"))
+    ]
+    write(folder / "optical.csv", [*lines[:6], lines[5].replace(",OK", ",Missing"), *lines[6:]])
+    refused(folder, "twice with other numbers", line=7)

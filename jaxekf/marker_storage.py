@@ -105,6 +105,7 @@ def _judged(
     """Which lines are of a marker that is seen; the others are masked, by reason."""
     blank, finite = np.asarray(np.isnan(position).all(axis=1)), intake.whole(position)
     order = np.lexsort((times, marker))
+    order = order[finite[order]]
     there = position[order]
     again = np.zeros(len(position), bool)
     same = (there[1:] == there[:-1]).all(axis=1) & (np.diff(marker[order]) == 0)

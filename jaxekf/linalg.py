@@ -29,6 +29,11 @@ def multiply_transposed(left: Array, right: Array) -> Array:
     return jnp.sum(left[:, None] * right[None], axis=2)
 
 
+def congruence(left: Array, matrix: Array) -> Array:
+    """``left @ matrix @ left.T`` of a symmetric matrix, (i, k, ...), (k, k, ...) to (i, i, ...)."""
+    return symmetrise(multiply_transposed(multiply(left, matrix), left))
+
+
 def identity_like(matrix: Array) -> Array:
     """The identity broadcast to the shape (n, n, ...) of `matrix`."""
     size = matrix.shape[0]
@@ -95,6 +100,31 @@ def whitener(matrix: Array) -> tuple[Array, Array]:
     zero = jnp.zeros_like(matrix[0, 0])
     factor = jnp.stack([jnp.stack(row + [zero] * (size - len(row))) for row in rows])
     return factor, jnp.stack(inverses)
+
+
+def semidefinite_factor(matrix: Array) -> Array:
+    """Lower factor ``L``, ``L @ L.T == matrix``, of a positive semidefinite matrix, (n, n, ...).
+
+    Where nothing but rounding is left of a variance its column is zero, with derivative zero. NaN
+    where the matrix is not semidefinite.
+    """
+    size = matrix.shape[0]
+    # What rounding may leave of a variance, and, by Schwarz' inequality, of a squared covariance.
+    tiny = 8.0 * size * jnp.finfo(matrix.dtype).eps
+    index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
+    scale = diagonal(matrix)
+    columns: list[Array] = []
+    for j in range(size):
+        rest = matrix[:, j]
+        for column in columns:
+            rest = rest - column * column[j][None]
+        positive = rest[j] > tiny * scale[j]
+        below = jnp.where(index > j, rest * rest - tiny * scale * scale[j][None], 0.0)
+        empty = (rest[j] >= -tiny * scale[j]) & (scale[j] >= 0.0) & jnp.all(below <= 0.0, axis=0)
+        inverse = lax.rsqrt(jnp.where(positive, rest[j], 1.0))
+        column = jnp.where((index >= j) & positive[None], rest * inverse[None], 0.0)
+        columns.append(jnp.where((positive | empty)[None], column, jnp.nan))
+    return jnp.stack(columns, axis=1)
 
 
 def whiten(white: tuple[Array, Array], right: Array) -> Array:

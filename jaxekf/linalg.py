@@ -109,21 +109,25 @@ def semidefinite_factor(matrix: Array) -> Array:
     where the matrix is not semidefinite.
     """
     size = matrix.shape[0]
-    # What rounding may leave of a variance, and, by Schwarz' inequality, of a squared covariance.
-    tiny = 8.0 * size * jnp.finfo(matrix.dtype).eps
     index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
-    scale = diagonal(matrix)
+    scale = diagonal(lax.stop_gradient(matrix))
+    deviation = jnp.sqrt(jnp.maximum(scale, 0.0))
+    # Root of what rounding may leave of each variance. Taking out a small variance makes it larger.
+    slack = jnp.sqrt(8.0 * size * jnp.finfo(matrix.dtype).eps) * deviation
     columns: list[Array] = []
     for j in range(size):
         rest = matrix[:, j]
         for column in columns:
             rest = rest - column * column[j][None]
-        positive = rest[j] > tiny * scale[j]
-        below = jnp.where(index > j, rest * rest - tiny * scale * scale[j][None], 0.0)
-        empty = (rest[j] >= -tiny * scale[j]) & (scale[j] >= 0.0) & jnp.all(below <= 0.0, axis=0)
+        positive = rest[j] > slack[j] * slack[j]
+        # By Schwarz' inequality little is left of the covariances either.
+        much = (index > j) & (jnp.abs(rest) > 2.0 * slack[j][None] * deviation)
+        empty = (rest[j] >= -slack[j] * slack[j]) & (scale[j] >= 0.0) & ~jnp.any(much, axis=0)
         inverse = lax.rsqrt(jnp.where(positive, rest[j], 1.0))
         column = jnp.where((index >= j) & positive[None], rest * inverse[None], 0.0)
         columns.append(jnp.where((positive | empty)[None], column, jnp.nan))
+        ratio = lax.stop_gradient(jnp.abs(column) * inverse[None])
+        slack = slack + jnp.where(index > j, ratio * slack[j][None], 0.0)
     return jnp.stack(columns, axis=1)
 
 

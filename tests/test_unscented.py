@@ -9,7 +9,7 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, unscented_transform
 from hypothesis import given
 from hypothesis import strategies as st
-from oracle import attitude_errors
+from oracle import attitude_errors, exp, right_jacobian
 from scipy.spatial.transform import Rotation
 
 from jaxekf import SO3, Euclidean, jit, rotation, unscented, vectors
@@ -174,7 +174,7 @@ def test_attitude_against_draws():
     coarse = np.kron(np.diag([0.04, 0.06]), np.linalg.cholesky(case(6)[1] / 3.0))
     turn = Rotation.from_rotvec([0.4, -1.0, 0.7])
     found, _, errors = drawn_attitudes(turn, coarse, standard)
-    fine, _, _ = drawn_attitudes(turn, 1e-3 * coarse, standard[:10])
+    fine, _, _ = drawn_attitudes(turn, 1e-3 * coarse, standard)
     truth, linear = np.cov(errors.T), 1e6 * fine.cov
     assert np.linalg.norm(found.cov - truth) <= 0.03 * np.linalg.norm(truth)
     assert np.linalg.norm(linear - truth) >= 0.1 * np.linalg.norm(truth)
@@ -194,6 +194,27 @@ def test_on_flat_spaces_nothing_changes():
 
     for a, b in zip(*both(mean, cov), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)
+
+
+def test_covariance_is_counted_from_the_new_mean():
+    """A covariance left at the function of the mean, or turned the wrong way, where the two differ."""
+
+    def vector(x):
+        return jnp.stack([0.1 * x[0], 0.05 * x[0] + 0.02 * x[1], 0.6 * x[1] ** 2])
+
+    @jit
+    def both(mean, cov):
+        plain = unscented.transform(vector, mean, cov)
+        flat, turn = Euclidean(2), SO3()
+        return plain, unscented.transform_on(
+            lambda x: rotation.exp(vector(x)), mean, cov, flat, turn
+        )
+
+    plain, on = both(np.zeros(2), np.eye(2))
+    jacobian = right_jacobian(np.asarray(plain.mean))
+    np.testing.assert_allclose(on.mean, exp(np.asarray(plain.mean)), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(on.cov, jacobian @ plain.cov @ jacobian.T, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(on.cross, plain.cross @ jacobian.T, rtol=0, atol=1e-15)
 
 
 def test_attitude_as_input():
@@ -275,6 +296,17 @@ def test_semidefinite_factor(seed, rank, scale):
         np.testing.assert_allclose(
             lower, np.linalg.cholesky(matrix), rtol=1e-5, atol=1e-9 * scale**0.5
         )
+
+
+def test_rounding_beside_small_variances():
+    """A singular covariance that looks indefinite once a variance of 1e-10 has been taken out."""
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        root = np.vstack([[1.0, 0.0], [1.0, 1e-5], rng.normal(size=(2, 2))])
+        matrix = root @ root.T
+        lower = np.asarray(factor(matrix))
+        bound = np.sqrt(np.outer(np.diag(matrix), np.diag(matrix)))
+        assert np.all(np.abs(lower @ lower.T - matrix) <= 1e-3 * bound)
 
 
 def test_what_is_no_covariance_is_not_mended():

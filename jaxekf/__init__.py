@@ -3,7 +3,7 @@
 JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
 """
 
-from jaxekf import manifold, rotation, timeline
+from jaxekf import manifold, rotation, timeline, unscented, vectors, wahba
 from jaxekf.consistency import Consistency, Whiteness
 from jaxekf.datasets import demo
 from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
@@ -112,4 +112,7 @@ __all__ = [
     "score",
     "split_at_gaps",
     "timeline",
+    "unscented",
+    "vectors",
+    "wahba",
 ]

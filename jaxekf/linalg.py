@@ -29,6 +29,11 @@ def multiply_transposed(left: Array, right: Array) -> Array:
     return jnp.sum(left[:, None] * right[None], axis=2)
 
 
+def congruence(left: Array, matrix: Array) -> Array:
+    """``left @ matrix @ left.T`` of a symmetric matrix, (i, k, ...), (k, k, ...) to (i, i, ...)."""
+    return symmetrise(multiply_transposed(multiply(left, matrix), left))
+
+
 def identity_like(matrix: Array) -> Array:
     """The identity broadcast to the shape (n, n, ...) of `matrix`."""
     size = matrix.shape[0]
@@ -95,6 +100,35 @@ def whitener(matrix: Array) -> tuple[Array, Array]:
     zero = jnp.zeros_like(matrix[0, 0])
     factor = jnp.stack([jnp.stack(row + [zero] * (size - len(row))) for row in rows])
     return factor, jnp.stack(inverses)
+
+
+def semidefinite_factor(matrix: Array) -> Array:
+    """Lower factor ``L``, ``L @ L.T == matrix``, of a positive semidefinite matrix, (n, n, ...).
+
+    Where nothing but rounding is left of a variance its column is zero, with derivative zero. NaN
+    where the matrix is not semidefinite.
+    """
+    size = matrix.shape[0]
+    index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
+    scale = diagonal(lax.stop_gradient(matrix))
+    deviation = jnp.sqrt(jnp.maximum(scale, 0.0))
+    # Root of what rounding may leave of each variance. Taking out a small variance makes it larger.
+    slack = jnp.sqrt(8.0 * size * jnp.finfo(matrix.dtype).eps) * deviation
+    columns: list[Array] = []
+    for j in range(size):
+        rest = matrix[:, j]
+        for column in columns:
+            rest = rest - column * column[j][None]
+        positive = rest[j] > slack[j] * slack[j]
+        # By Schwarz' inequality little is left of the covariances either.
+        much = (index > j) & (jnp.abs(rest) > 2.0 * slack[j][None] * deviation)
+        empty = (rest[j] >= -slack[j] * slack[j]) & (scale[j] >= 0.0) & ~jnp.any(much, axis=0)
+        inverse = lax.rsqrt(jnp.where(positive, rest[j], 1.0))
+        column = jnp.where((index >= j) & positive[None], rest * inverse[None], 0.0)
+        columns.append(jnp.where((positive | empty)[None], column, jnp.nan))
+        ratio = lax.stop_gradient(jnp.abs(column) * inverse[None])
+        slack = slack + jnp.where(index > j, ratio * slack[j][None], 0.0)
+    return jnp.stack(columns, axis=1)
 
 
 def whiten(white: tuple[Array, Array], right: Array) -> Array:

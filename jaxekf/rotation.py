@@ -140,6 +140,34 @@ def to_matrix(q: Array) -> Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def from_matrix(matrix: Array) -> Array:
+    """Quaternion with ``w >= 0`` of the rotation matrix ``R``, shapes (..., 3, 3) to (..., 4).
+
+    Shepperd's way: the entries of ``R`` give ``4 q q'``, of which the row of the largest component is
+    taken, so that nothing small is divided by, at half a turn either. What `matrix` holds beside a
+    rotation, rounding for instance, is not looked for.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (tuple(matrix[..., j, k] for k in range(3)) for j in range(3))
+    rows = [
+        [1 + a + e + i, h - f, c - g, d - b],
+        [h - f, 1 + a - e - i, d + b, c + g],
+        [c - g, d + b, 1 - a + e - i, h + f],
+        [d - b, c + g, h + f, 1 - a - e + i],
+    ]
+    best, chosen = rows[0][0], jnp.stack(rows[0], axis=-1)
+    for j in range(1, 4):
+        larger = rows[j][j] > best
+        best = jnp.where(larger, rows[j][j], best)
+        chosen = jnp.where(larger[..., None], jnp.stack(rows[j], axis=-1), chosen)
+    q = normalise(chosen)
+    return jnp.where(q[..., :1] < 0.0, -q, q)
+
+
+def align(q: Array, near: Array) -> Array:
+    """``q`` or ``-q``, whichever is nearer to the quaternion `near`, shapes (..., 4)."""
+    return jnp.where(jnp.sum(q * near, axis=-1, keepdims=True) < 0.0, -q, q)
+
+
 def difference(q: Array, r: Array) -> Array:
     """Rotation vector from ``q`` to ``r`` in the body frame of ``q``: ``log(conj(q) * r)``."""
     return log(product(conjugate(q), r))

@@ -50,6 +50,14 @@ def left_matrix(q):
     return np.vstack([np.concatenate([[q[0]], -q[1:]]), lower])
 
 
+def attitude_errors(q, estimates):
+    """Rotation vectors (N, 3), in the body frame of ``q``, that take it to `estimates` (N, 4)."""
+    turned = np.asarray(estimates) @ left_matrix(conjugate(np.asarray(q))).T
+    turned *= np.where(turned[:, :1] < 0.0, -1.0, 1.0)
+    length = np.sqrt(np.sum(turned[:, 1:] ** 2, axis=1, keepdims=True))
+    return 2.0 * np.arctan2(length, turned[:, :1]) / length * turned[:, 1:]
+
+
 def right_jacobian(v):
     """``exp(v + e) ~ exp(v) exp(right_jacobian(v) e)``."""
     angle = np.sqrt(v @ v)

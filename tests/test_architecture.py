@@ -18,8 +18,8 @@ ORDER = [
     ("files",),
     ("densities", "rest", "intake", "text", "container_guard", "likeness"),
     ("allan",),
-    ("manifold", "tables", "truth", "description", "streams", "gaps"),
-    ("stated", "hashes"),
+    ("manifold", "tables", "truth", "description", "streams", "gaps", "vectors"),
+    ("stated", "hashes", "unscented", "wahba"),
     ("model", "pose", "synchronise", "marker_storage", "encoder_storage", "export", "requested"),
     (
         "timeline",

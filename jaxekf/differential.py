@@ -37,7 +37,7 @@ class RateEstimate(NamedTuple):
     transition: Array
     """Derivative (3, 3) of `rate` by the rate one interval before, for small residuals."""
     cost: Array
-    """Sum of squared residuals in units of the noise, (); `Differences.count` less 3 on average."""
+    """Sum of squared residuals in units of the noise, (); `Differences.independent` less 3 on average."""
     degenerate: Array
     """The array cannot tell all of the angular acceleration, wherever it is at, ()."""
     singular: Array
@@ -153,13 +153,13 @@ def track(
     first sample; `interval`, s, is one number () or one for each sample (N,). With `start_covariance`
     (3, 3) the covariances are those of the whole way; without it, of each step.
     """
-    prepared = differences(array, noise)
     readings, start_rate = jnp.asarray(readings), jnp.asarray(start_rate)
-    n = prepared.linear.shape[0]
+    n = jnp.shape(array.axes)[0]
     if readings.ndim != 2 or readings.shape[1] != n:
         raise ValueError(
             f"got readings of shape {readings.shape}, expected (N, {n}); give one column for each axis"
         )
+    prepared = differences(array, noise)
     intervals = jnp.broadcast_to(jnp.asarray(interval, readings.dtype), readings.shape[:1])
 
     def advance(

@@ -39,7 +39,7 @@ class Differences(NamedTuple):
     """The paper's matrix M (n, 3), per rad/s^2."""
     quadratic: Array
     """Symmetric matrix of the centripetal part of each row (n, 3, 3), per (rad/s)^2."""
-    count: Array
+    independent: Array
     """How many independent differences there are, (): n less the rank of the axes."""
     degenerate: Array
     """Whether they leave part of the angular acceleration unknown, (): rank of `linear` below 3."""

@@ -82,7 +82,11 @@ def orthogonalise(matrix: Array, right: Array) -> Factors:
     weak = jnp.sum(lax.stop_gradient(unknown) ** 2) * (WEAK * scale) ** 2 >= 1.0
     rights = jnp.stack([r[0, 3], r[1, 3], r[2, 3]])
     return Factors(
-        jnp.stack(basis, axis=1), _upper_inverse(*above, small), unknown, rights, weak | (total == 0.0)
+        jnp.stack(basis, axis=1),
+        _upper_inverse(*above, small),
+        unknown,
+        rights,
+        weak | (total == 0.0),
     )
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf.linalg import symmetrise
+from jaxekf.linalg import multiply, multiply_transposed, symmetrise
 from jaxekf.placement import AccelerometerArray, Differences, differences
 from jaxekf.three_unknowns import Factors, Quadratic, descend, minimise, orthogonalise
 
@@ -76,10 +76,11 @@ def angular_rate(
     rate, converged = minimise(problem, lax.stop_gradient(rate_before))
     residual = problem.residual(rate)
     factors = orthogonalise(problem.jacobian(rate), residual)
-    transition = factors.inverse @ (factors.basis.T @ linear)
-    cov = factors.large @ factors.large.T
+    transition = multiply(factors.inverse, multiply(factors.basis.T, linear))
+    cov = multiply_transposed(factors.large, factors.large)
     if covariance_before is not None:
-        cov = cov + transition @ covariance_before @ transition.T
+        carried = multiply_transposed(covariance_before, transition)
+        cov = cov + multiply(transition, carried)
     cost = jnp.sum(residual * residual)
     return RateEstimate(
         rate,
@@ -100,12 +101,15 @@ def _has_rival(
 
     The residuals at rates a and b differ by exactly ``J((a + b) / 2) @ (a - b)``, J the Jacobian. So
     where J stays regular, all the way to the opposite rate and several times as far as the rate moved,
-    there is no other, and nothing is searched.
+    there is no other, and nothing is searched. It does where, in the coordinates in which J at `rate` is
+    the identity, it changes by less than one.
     """
     moved = jnp.sqrt(jnp.sum((rate - before) ** 2))
     reach = jnp.maximum(jnp.sqrt(jnp.sum(rate * rate)), 0.5 * (1.0 + _AS_FAR) * moved)
-    least = lax.rsqrt(jnp.sum(factors.large**2))
-    regular = least > 2.0 * jnp.sqrt(jnp.sum(problem.curved**2)) * reach
+    curved = problem.curved.reshape(-1, 9)
+    seen = multiply(factors.basis.T, curved).reshape(3, 3, 3)
+    change = multiply(factors.inverse.T, seen.swapaxes(0, 1).reshape(3, 9))
+    regular = ~factors.weak & (2.0 * reach * jnp.sqrt(jnp.sum(change**2)) < 1.0)
 
     def search() -> Array:
         across = rate + _across(problem, rate, factors, reach)

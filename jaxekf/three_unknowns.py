@@ -10,10 +10,16 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxekf.linalg import multiply
+
 # A direction in which the Jacobian is below this part of its size counts as undetermined.
 WEAK = 1e-7
 _MOST_STEPS = 60
-_POLISHING_STEPS = 2
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    """``matrix @ vector`` as a sum, which on a CPU joins the arithmetic around it."""
+    return jnp.sum(matrix * vector[None, :], axis=1)
 
 
 class Quadratic(NamedTuple):
@@ -28,11 +34,15 @@ class Quadratic(NamedTuple):
 
     def residual(self, x: Array) -> Array:
         """Residuals (n,) at `x` (3,)."""
-        return self.constant + self.linear @ x + jnp.einsum("ijk,j,k->i", self.curved, x, x)
+        return self.constant + _times(self.linear + self.bent(x), x)
 
     def jacobian(self, x: Array) -> Array:
         """Derivative (n, 3) of the residuals at `x` (3,)."""
-        return self.linear + 2.0 * jnp.einsum("ijk,k->ij", self.curved, x)
+        return self.linear + 2.0 * self.bent(x)
+
+    def bent(self, x: Array) -> Array:
+        """``curved @ x`` (n, 3)."""
+        return jnp.sum(self.curved * x[None, None, :], axis=2)
 
 
 class Factors(NamedTuple):
@@ -94,7 +104,7 @@ def _inverse_near_one(matrix: Array) -> Array:
     """Inverse (3, 3) by cofactors; the identity where there is none worth having."""
     a, b, c = matrix
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-    determinant = jnp.dot(a, rows[:, 0])
+    determinant = jnp.sum(a * rows[:, 0])
     good = jnp.abs(determinant) > 1e-9
     scaled = rows / jnp.where(good, determinant, 1.0)
     return jnp.where(good, scaled, jnp.eye(3, dtype=matrix.dtype))
@@ -105,8 +115,8 @@ def _bend(problem: Quadratic, residual: Array, factors: Factors) -> Array:
 
     The identity where all residuals are zero.
     """
-    second = 2.0 * jnp.einsum("i,ijk->jk", residual, problem.curved)
-    inside = factors.inverse.T @ second @ factors.inverse
+    second = 2.0 * jnp.sum(residual[:, None, None] * problem.curved, axis=0)
+    inside = multiply(multiply(factors.inverse.T, second), factors.inverse)
     return _inverse_near_one(jnp.eye(3, dtype=second.dtype) + inside)
 
 
@@ -118,7 +128,7 @@ def _damped_step(problem: Quadratic, x: Array, damping: Array) -> Array:
     rows = jnp.concatenate([jacobian, weight * jnp.eye(3, dtype=x.dtype)])
     right = jnp.concatenate([problem.residual(x), jnp.zeros(3, x.dtype)])
     factors = orthogonalise(rows, right)
-    return -factors.inverse @ factors.right
+    return -_times(factors.inverse, factors.right)
 
 
 def tolerance(x: Array) -> float:
@@ -167,14 +177,12 @@ def minimise(problem: Quadratic, start: Array) -> tuple[Array, Array]:
     `start`. What the residuals leave undetermined stays near `start`, and has derivative zero.
     """
     x, _ = descend(problem, start)
-    length = jnp.zeros((), x.dtype)
-    for _ in range(_POLISHING_STEPS):
-        # Undamped, by the full second derivative: to rounding, and an honest sign of convergence.
-        residual = problem.residual(x)
-        factors = orthogonalise(problem.jacobian(x), residual)
-        step = -factors.inverse @ (_bend(problem, residual, factors) @ factors.right)
-        length = jnp.sqrt(jnp.sum(step * step)) / (1.0 + jnp.sum(jnp.abs(x)))
-        x = jnp.where(length <= 1e4 * tolerance(x), x + step, x)
+    # Undamped and by the full second derivative: down to rounding, and an honest sign of convergence.
+    residual = problem.residual(x)
+    factors = orthogonalise(problem.jacobian(x), residual)
+    step = -_times(factors.inverse, _times(_bend(problem, residual, factors), factors.right))
+    length = jnp.sqrt(jnp.sum(step * step)) / (1.0 + jnp.sum(jnp.abs(x)))
+    x = jnp.where(length <= 1e4 * tolerance(x), x + step, x)
     return x, length <= tolerance(x)
 
 
@@ -187,6 +195,6 @@ def _minimise_jvp(
     x, converged = minimise(problem, start)
     residual = problem.residual(x)
     factors = orthogonalise(problem.jacobian(x), change.residual(x))
-    towards = factors.right + factors.inverse.T @ (change.jacobian(x).T @ residual)
-    moved = -factors.inverse @ (_bend(problem, residual, factors) @ towards)
+    towards = factors.right + _times(factors.inverse.T, _times(change.jacobian(x).T, residual))
+    moved = -_times(factors.inverse, _times(_bend(problem, residual, factors), towards))
     return (x, converged), (moved, jnp.zeros(converged.shape, jax.dtypes.float0))  # pyright: ignore

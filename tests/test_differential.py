@@ -254,6 +254,28 @@ def test_derivatives():
         assert np.abs(exact[of == "noise"][:, :3]).max() > 1e-4
 
 
+def second_along(case, way):
+    """Second derivative (3,) of the rate along a straight line."""
+
+    def slope(t):
+        moved = jax.tree.map(lambda at, d: at + t * d, case, way)
+        return jax.jvp(lambda c: found(**c).rate, (moved,), (way,))[1]
+
+    return jax.jvp(slope, (0.0,), (1.0,))[1]
+
+
+def test_second_derivative():
+    """A rule for a derivative that is itself not differentiated as it should be."""
+    case, rng = noisy_case(), np.random.default_rng(12)
+    way = {name: 0.1 * np.abs(at).max() * rng.normal(size=at.shape) for name, at in case.items()}
+    step = 2e-3
+    line = [jax.tree.map(lambda at, d, k=k: at + k * step * d, case, way) for k in range(-3, 4)]
+    weights = np.array([2, -27, 270, -490, 270, -27, 2]) / (180 * step**2)
+    expected = weights @ solve(line).rate
+    got = kernels.jit(second_along)(case, way)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
 def test_transition_is_the_derivative_by_the_rate_before():
     """A transition, or its part in the covariance, that is not the derivative the filter needs."""
     case, step = noisy_case(), 1e-4

@@ -5,7 +5,8 @@ acceleration is eq. 3's backward difference with the rate before known, ``alpha 
 omega(t - T)) / T``, which leaves ``omega(t)`` as three unknowns whose residuals are quadratic.
 
 The rate is integrated, so its error is too: it goes on by `RateEstimate.transition` at each sample,
-which grows or decays with rate and geometry. Something else, such as an attitude, must bound it.
+which grows or decays with rate and geometry: with six axes and rates of 20 rad/s by many powers of
+ten in seconds, with twelve by far less. Something else, such as an attitude, must bound it.
 """
 
 from typing import NamedTuple

@@ -126,12 +126,10 @@ def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
     )
     projector, inverse = _left_out(unprojected @ axes)
     whitening = projector @ unprojected
-    # The origin is free, as the specific force there is: at the middle least is lost to rounding.
-    centred = positions - jnp.mean(positions, axis=0, keepdims=True)
-    outer = axes[:, :, None] * centred[:, None, :]
-    trace = jnp.sum(axes * centred, axis=1)[:, None, None]
+    outer = axes[:, :, None] * positions[:, None, :]
+    trace = jnp.sum(axes * positions, axis=1)[:, None, None]
     curved = 0.5 * (outer + outer.swapaxes(1, 2)) - trace * jnp.eye(3, dtype=axes.dtype)[None]
-    linear = whitening @ jnp.cross(centred, axes)
+    linear = whitening @ jnp.cross(positions, axes)
     scale = jnp.max(jnp.abs(unprojected @ axes)) * jnp.max(jnp.abs(positions))
     size = jnp.linalg.svd(jax.lax.stop_gradient(linear), compute_uv=False)
     rank = jnp.sum(size > _RANK * jnp.maximum(size[0], jax.lax.stop_gradient(scale)))

@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from jaxekf import kernels
 from jaxekf.differential import angular_rate, track
-from jaxekf.placement import AccelerometerArray, differences, exact_readings, three_dual_axis
+from jaxekf.placement import (
+    AccelerometerArray,
+    _left_out,
+    differences,
+    exact_readings,
+    three_dual_axis,
+)
 
 # Arrays have as many axes, of which some may feel nothing, so that one program serves all tests.
 N = 12
@@ -355,6 +361,29 @@ def test_axes_of_a_plane_tell_the_rate():
     got = solve([make_case(positions, axes, rate, rate + 0.1)])
     assert got.valid[0]
     np.testing.assert_allclose(got.rate[0], rate, rtol=0, atol=1e-9)
+
+
+def test_derivative_of_the_projection_at_a_lower_rank():
+    """A derivative of projector or inverse that holds for axes of full rank only; by NumPy's inverse."""
+    rng = np.random.default_rng(13)
+    tall, tall_change = rng.normal(size=(2, 7, 2))
+    wide, wide_change = rng.normal(size=(2, 2, 3))
+
+    def path(t):
+        return (tall + t * tall_change) @ (wide + t * wide_change)
+
+    def by_numpy(t):
+        inverse = np.linalg.pinv(path(t), rcond=1e-9)
+        return np.eye(7) - path(t) @ inverse, inverse
+
+    change = tall_change @ wide + tall @ wide_change
+    value, slope = kernels.jit(lambda m, d: jax.jvp(_left_out, (m,), (d,)))(path(0.0), change)
+    step = 1e-5
+    for got, there, ahead, behind, rate in zip(
+        value, by_numpy(0.0), by_numpy(step), by_numpy(-step), slope, strict=True
+    ):
+        np.testing.assert_allclose(got, there, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(rate, (ahead - behind) / (2 * step), rtol=0, atol=1e-7)
 
 
 def test_missing_readings_are_no_rate():

@@ -90,11 +90,12 @@ def test_hdf5_folder_npz_round_trip(tmp_path, make):
     assert three.info["seed"] == run.info["seed"]
 
 
-FLOATS = st.one_of(st.floats(-1e6, 1e6), st.sampled_from([5e-324, -0.0, 1e300]))
+FLOATS = st.one_of(st.floats(-9e5, 9e5), st.sampled_from([5e-324, -0.0]))
+"""What a sensor may read: beyond a million it is masked."""
 
 
 @given(
-    steps=st.lists(st.integers(1, 400_000_000), min_size=1, max_size=8),
+    steps=st.lists(st.integers(50_000, 400_000_000), min_size=1, max_size=8),
     start=st.integers(-(2**61), 2**61),
     values=st.lists(FLOATS, min_size=4, max_size=4),
     hidden=st.lists(st.booleans(), min_size=9, max_size=9),

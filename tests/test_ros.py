@@ -96,7 +96,7 @@ def write(folder, kind, topics, make=None):
             connection = writer.add_connection(topic, name, typestore=make.store)
             for i, message in enumerate(messages):
                 serialize = make.store.serialize_ros1 if make.ros1 else make.store.serialize_cdr
-                writer.write(connection, START + 7 + i, serialize(message, name))
+                writer.write(connection, START + 7 + 1_000_000 * i, serialize(message, name))
     if kind.endswith("file"):
         suffix = kind.split()[0]
         return shutil.move(path / f"run.{suffix}", folder / f"alone.{suffix}")
@@ -290,7 +290,7 @@ def test_stamps(tmp_path):
     ):
         ros.load(path)
     again = ros.load(path, stamps="receive")
-    np.testing.assert_array_equal(again.imu.time_ns, START + 7 + np.arange(20))
+    np.testing.assert_array_equal(again.imu.time_ns, START + 7 + 1_000_000 * np.arange(20))
     assert "recorder" in " ".join(again.info["assumptions"])
     (tmp_path / "b").mkdir()
     path = imu_bag(tmp_path / "b", spoil=lambda i: {"time_ns": 0} if i == 0 else {})

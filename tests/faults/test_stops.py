@@ -27,6 +27,14 @@ estimate_command = importlib.import_module("jaxekf.cli.estimate")
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals and pipes are POSIX's")
 
 
+@pytest.fixture(autouse=True)
+def _can_be_interrupted():
+    """Ctrl-C as at a terminal, here and in what is started: a job in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def call(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
 

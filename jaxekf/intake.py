@@ -93,15 +93,8 @@ def optical(
         with np.errstate(invalid="ignore"):
             reasons[f"fit error over {error_max:g} m"] = error > error_max
     valid, account = mask_first(place, time_ns, account, reasons)
-    if not valid.any():
-        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
-        raise place.error(
-            None,
-            None,
-            f"no usable row among {account.rows} ({told})",
-            "at least one",
-            "a run in which the tool is seen, or stating the status words that are good (status_ok)",
-        )
+    hint = "a run in which the tool is seen, or stating the status words that are good (status_ok)"
+    need_usable(place, valid, account, "row", hint)
     coarse = rounded(quaternion[valid])
     account = replace(
         account, notes=(*account.notes, *notes), has_status=status is not None, rounded=coarse
@@ -172,14 +165,8 @@ def encoder(
     seen = np.where(hidden[:, None], np.nan, quaternion[order])
     unit, lost, notes = judge_quaternions(place, seen)
     valid, account = mask_first(place, time_ns, account, {"hidden": hidden} | lost)
-    if not valid.any():
-        raise place.error(
-            None,
-            None,
-            f"no usable row among {account.rows}",
-            "at least one",
-            "leaving the stream out where there is no truth",
-        )
+    hint = "leaving the stream out where there is no truth"
+    need_usable(place, valid, account, "row", hint)
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
     return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
@@ -274,6 +261,14 @@ def mask_first(
             masked[name] = reasoned(place, rows, time_ns[rows])
             valid[rows] = False
     return valid, replace(intake, masked=masked)
+
+
+def need_usable(place: Place, valid: Flags, account: Intake, what: str, hint: str) -> None:
+    """Raise `RecordingError`, with the reasons, where no row (or line) is valid."""
+    if not valid.any():
+        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
+        got = f"no usable {what} among {account.rows} ({told})"
+        raise place.error(None, None, got, "at least one", hint)
 
 
 def huge(values: Floats) -> Flags:

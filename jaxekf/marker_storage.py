@@ -53,10 +53,11 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     error = None if error is None else length * error
     quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
     columns = [a for a in (position, quality, error) if a is not None]
+    every = stamps(table)
     order, account = intake.in_order(
-        table.place, stamps(table), columns, sort=source.sort, part=marker, parts=names
+        table.place, every, columns, sort=source.sort, part=marker, parts=names
     )
-    all_marker, times, marker = marker, stamps(table)[order], marker[order]
+    all_marker, times, marker = marker, every[order], marker[order]
     intake.check_rate(table.place, np.unique(times))
     first = np.concatenate([[True], np.diff(times) > 0])
     frame = np.cumsum(first) - 1
@@ -74,9 +75,7 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     there[frame, marker] = True
     gone = np.setdiff1d(np.arange(len(all_marker)), order)
     parts = {
-        name: Part(
-            int(lines[m]), stamps(table)[gone[all_marker[gone] == m]], times[first][~there[:, m]]
-        )
+        name: Part(int(lines[m]), every[gone[all_marker[gone] == m]], times[first][~there[:, m]])
         for m, name in enumerate(names)
     }
     seen, account = _judged(place_of_kept, times, position[order], marker, account)
@@ -119,15 +118,7 @@ def _judged(
     if not intake.rounded(position[finite]):
         reasons["suspicious (position repeated exactly)"] = again
     seen, account = intake.mask_first(place, times, account, reasons)
-    if not seen.any():
-        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
-        raise place.error(
-            None,
-            None,
-            f"no usable line among {account.rows} ({told})",
-            "at least one",
-            "a run in which markers are seen",
-        )
+    intake.need_usable(place, seen, account, "line", "a run in which markers are seen")
     return seen, account
 
 

@@ -245,21 +245,6 @@ def _check_stream(place: Path | str, label: str, stream: Any) -> None:
         )
 
 
-def unit_quaternions(values: Floats, tolerance: float = 0.1) -> tuple[Floats, Flags]:
-    """Quaternions scaled to unit norm, and which of them were quaternions at all.
-
-    A tracker writes a missing tool as a zero quaternion or leaves it out (NaN): such a row, or one
-    whose norm is off by more than `tolerance`, is not valid and becomes the identity.
-    """
-    norm = np.linalg.norm(values, axis=1)
-    with np.errstate(invalid="ignore"):
-        valid = np.abs(norm - 1.0) <= tolerance
-    unit = np.zeros_like(values)
-    unit[:, 0] = 1.0
-    unit[valid] = values[valid] / norm[valid, None]
-    return unit, valid
-
-
 def to_scipy(q: Floats) -> Rotation:
     """SciPy's rotation (which stores x, y, z, w) of quaternions w, x, y, z."""
     return Rotation.from_quat(np.roll(np.asarray(q), -1, axis=-1))

@@ -65,11 +65,6 @@ class Table:
         """Where its rows stand."""
         return Place(self.path, self.text.lines)
 
-    @property
-    def rows(self) -> int:
-        """Rows of samples in the file, those cut short included."""
-        return len(self.text.lines) + len(self.text.cut)
-
     def __len__(self) -> int:
         return len(self.text.lines)
 

@@ -57,8 +57,6 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
     intake.check_rate(place, time[order])
     kept, count = place.take(order), len(names)
     each = np.repeat(np.arange(len(order)), count)
-    finite = np.isfinite(position[order]).all(axis=2)
-    reasons = {"hidden": ~said[order].reshape(-1), "position not finite": ~finite.reshape(-1)}
     repeated = {
         reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
         for reason, r in account.dropped.items()
@@ -66,7 +64,14 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
     again = [r.time_ns for r in account.dropped.values()]
     parts = {name: Part(len(time), np.concatenate([*again, time[:0]]), time[:0]) for name in names}
     account = replace(account, rows=len(time) * count, dropped=repeated, parts=parts)
-    seen, account = intake.mask_first(kept.take(each), time[order][each], account, reasons)
+    seen, account = intake.judge_markers(
+        kept.take(each),
+        time[order][each],
+        position[order].reshape(-1, 3),
+        np.tile(np.arange(count), len(order)),
+        account,
+        seen=said[order].reshape(-1) if "visible" in group else None,
+    )
     reported = {
         key: values if values is None else values[order]
         for key, values in (
@@ -77,7 +82,7 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
     return Markers(
         time[order],
         position[order],
-        seen.reshape(finite.shape),
+        seen.reshape(len(order), count),
         names,
         group["p_body_marker"],
         quality_min=description.finite_number(

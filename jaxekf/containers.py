@@ -19,12 +19,13 @@ import numpy as np
 import tomli_w
 
 from jaxekf import container_layout as layout
-from jaxekf import container_streams, description, export, intake
+from jaxekf import container_streams, description, export
 from jaxekf.container_files import SUFFIXES, of_fixed_length, open_container
 from jaxekf.description import SCHEMA_VERSION
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_file
 from jaxekf.recording import STREAMS, Recording
+from jaxekf.repeats import without_repeats
 from jaxekf.rows import Intake, Place
 
 _ROOT = ("kind", "schema_version", "name", "info", "sha256")
@@ -98,7 +99,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         )
     recording = _assemble(path, said, data, sort=sort, own=own)
     if not own:
-        recording = intake.without_repeats(recording)
+        recording = without_repeats(recording)
     return _noted(recording, content.others)
 
 

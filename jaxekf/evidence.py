@@ -176,9 +176,9 @@ def some_frames(markers: Markers, rows: Indices) -> Markers:
 def _other_readings(recording: Recording) -> dict[str, likeness.Reading]:
     """What the quaternion may be instead, by the entry of `recording.toml` that would say so."""
     about = recording.info.get("optical_about", {})
-    order, _, direction = str(about.get("quaternion", BODY_TO_REFERENCE)).partition(", ")
-    order = order.replace(" ", "")
-    direction = direction or "body to reference"
+    said = [part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")]
+    order = ",".join([part for part in said if len(part) == 1] or "wxyz")
+    direction = next((part for part in said if len(part) > 1), "body to reference")
     turned = "reference to body" if direction == "body to reference" else "body to reference"
     found: dict[str, likeness.Reading] = {
         f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])

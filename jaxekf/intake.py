@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxekf.recording import Encoder, Flags, Floats, Imu, Optical, Recording, Times
+from jaxekf.recording import Encoder, Flags, Floats, Imu, Optical, Times
 from jaxekf.rows import Indices, Intake, Place, Reason
 
 MOST_BAD_NORMS = 0.05
@@ -23,8 +23,6 @@ SLOWEST_S, SLOWEST_TRACKER_S = 0.5, 1.5
 FASTEST_S = 2e-5
 _BEYOND = 1e6
 """SI: what no sensor reads, such as the huge numbers that stand for a lost tool."""
-_RESTING, _TURNED, _STILL = 0.05, 0.04, 0.02
-"""rad/s and rad that a gyroscope of a resting tool tells at most, and rad/s below which a tool rests."""
 STATUS_OK = ("ok", "0")
 """Words of a status that mean a good sample, unless others are stated; in lower case."""
 NDI_STATUS = {
@@ -170,6 +168,42 @@ def encoder(
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
     return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
+
+
+def judge_markers(
+    place: Place,
+    time_ns: Times,
+    position: Floats,
+    marker: Indices,
+    account: Intake,
+    *,
+    seen: Flags | None = None,
+) -> tuple[Flags, Intake]:
+    """Which rows (N,), each of a marker (N,) at a position (N, 3), are of one that is seen; the others are
+    masked, by reason.
+
+    `seen` (N,) is what the source itself says of each row, where it does: a position that is repeated
+    exactly is then believed, as of a tool that rests. Raises `RecordingError` where no row is left.
+    """
+    blank, finite = np.asarray(np.isnan(position).all(axis=1)), whole(position)
+    reasons = {} if seen is None else {"hidden": ~seen}
+    reasons |= {
+        "blank": blank,
+        "not finite": ~finite,
+        "missing marker (zeros)": finite & np.asarray((position == 0.0).all(axis=1)),
+        "beyond any tracker": huge(position),
+    }
+    if seen is None and not rounded(position[finite]):
+        order = np.lexsort((time_ns, marker))
+        order = order[finite[order]]
+        there = position[order]
+        again = np.zeros(len(position), bool)
+        same = (there[1:] == there[:-1]).all(axis=1) & (np.diff(marker[order]) == 0)
+        again[order[1:][same]] = True
+        reasons["suspicious (position repeated exactly)"] = again
+    valid, account = mask_first(place, time_ns, account, reasons)
+    need_usable(place, valid, account, place.unit, "a run in which markers are seen")
+    return valid, account
 
 
 def in_order(
@@ -344,7 +378,7 @@ def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> No
             "time",
             f"a sample every {step:.3g} s",
             f"a rate of {1e-3 / FASTEST_S:g} kHz at most",
-            'stating the unit of its times: time_unit = "s", or "ms"',
+            _unit_hint(place, 's", or "ms'),
         )
     if step < slowest_s:
         return
@@ -356,8 +390,15 @@ def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> No
                 "time",
                 f"a sample every {step:.6g} s",
                 f"a rate of more than {1.0 / slowest_s:.2g} Hz (in {unit} it would be {rate:.4g} Hz)",
-                f'stating the unit of its times: time_unit = "{unit}"',
+                _unit_hint(place, unit),
             )
+
+
+def _unit_hint(place: Place, unit: str) -> str:
+    """Only the rows of a text have a unit that may be stated: data sets hold nanoseconds."""
+    if place.unit == "sample":
+        return "writing time_ns in nanoseconds"
+    return f'stating the unit of its times: time_unit = "{unit}"'
 
 
 def _seconds(time_ns: int) -> str:
@@ -369,87 +410,3 @@ def rounded(values: Floats) -> bool:
     finite = values[np.isfinite(values)]
     scaled = 1e4 * finite[np.abs(finite) < 1e6]
     return bool(np.all(np.abs(scaled - np.round(scaled)) < 1e-6)) if scaled.size else False
-
-
-def without_repeats(recording: Recording) -> Recording:
-    """A run in which poses that a tracker repeats to the last bit are masked: so looks a lost tool.
-
-    Where the gyroscope turns meanwhile the pose is frozen, whatever the status says. Where it does not, a
-    status that is good is believed, and so are numbers of four decimals or fewer, which repeat of
-    themselves; other repeats are suspicious, and the identity at the origin from its first row on.
-    """
-    stream, account = recording.optical, recording.intake.get("optical")
-    if stream is None or account is None:
-        return recording
-    seen = np.flatnonzero(stream.valid)
-    pose = stream.q_ref_body[seen]
-    if stream.position is not None:
-        pose = np.concatenate([pose, stream.position[seen]], axis=1)
-    again = (pose[1:] == pose[:-1]).all(axis=1)
-    if not again.any():
-        return recording
-    repeated = np.concatenate([[False], again])
-    first = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(seen))))
-    frozen = repeated & _turned(recording, seen, first)
-    home = np.zeros(pose.shape[1])
-    home[0] = 1.0
-    lost = (pose == home).all(axis=1) & (stream.position is not None)
-    lost &= repeated | np.concatenate([again, [False]])
-    # The first row of a pose that lasts while the tool turns is good; that of a lost tool is not.
-    frozen[first[frozen & lost]] = True
-    names = {"frozen while the IMU moves": frozen}
-    if not account.has_status:
-        names["suspicious (identity at the origin, repeated)"] = lost
-        if not account.rounded:
-            names["suspicious (pose repeated exactly)"] = repeated
-    place = Place(recording.path or recording.name, account.numbers)
-    bad = np.zeros(len(seen), bool)
-    for name, which in names.items():
-        rows = seen[which & ~bad]
-        bad |= which
-        if rows.size:
-            account = account.with_masked(name, reasoned(place, rows, stream.time_ns[rows]))
-    if not bad.any():
-        return recording
-    valid = stream.valid.copy()
-    valid[seen[bad]] = False
-    if not valid.any():
-        raise place.error(
-            None, None, "one pose in all rows", "a tool that moves", "a run in which it is seen"
-        )
-    return recording.replace(
-        optical=replace(stream, valid=valid), intake={**recording.intake, "optical": account}
-    )
-
-
-def _turned(recording: Recording, seen: Indices, first: Indices) -> Flags:
-    """Whether the gyroscope turns by more than its noise since the first row of the same pose (n,)."""
-    stream, imu = recording.optical, recording.imu
-    assert stream is not None
-    if imu is None:
-        return np.zeros(len(seen), bool)
-    taken = stream.time_ns[seen] - stream.latency_ns
-    rate = imu.gyroscope - _resting_rate(stream, imu, seen, first, taken)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(rate, axis=0)])
-    low = np.clip(np.searchsorted(imu.time_ns, taken[first]), 0, len(imu.time_ns) - 1)
-    high = np.clip(np.searchsorted(imu.time_ns, taken, side="right"), low + 1, len(imu.time_ns))
-    lasts = (taken - taken[first]) * 1e-9
-    mean = np.linalg.norm((total[high] - total[low]) / (high - low)[:, None], axis=1)
-    return (mean > _RESTING) | (mean * lasts > _TURNED)
-
-
-def _resting_rate(stream: Optical, imu: Imu, seen: Indices, first: Indices, taken: Times) -> Floats:
-    """What the gyroscope reads while the tracker says that the tool rests: its bias; else 0."""
-    step = max(1, int(np.searchsorted(taken, taken[0] + 500_000_000)))
-    a, b = stream.q_ref_body[seen[:-step]], stream.q_ref_body[seen[step:]]
-    if not len(a):
-        return np.zeros(3)
-    angle = 2.0 * np.arccos(np.clip(np.abs(np.sum(a * b, axis=1)), 0.0, 1.0))
-    span = (taken[step:] - taken[:-step]) * 1e-9
-    # A pose that is the same for long is what is in doubt.
-    new = first == np.arange(len(first))
-    still = (angle < _STILL * span) & new[:-step] & new[step:] & (span < 2.0)
-    if still.sum() < 10:
-        return np.zeros(3)
-    at = np.clip(np.searchsorted(imu.time_ns, taken[:-step][still]), 0, len(imu.time_ns) - 1)
-    return np.median(imu.gyroscope[at], axis=0)

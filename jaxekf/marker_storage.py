@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Flags, Floats, Markers, Times
-from jaxekf.rows import Intake, Part, Place
+from jaxekf.recording import Floats, Markers
+from jaxekf.rows import Intake, Part
 from jaxekf.tables import (
     POSITION,
     Sheet,
@@ -78,7 +78,7 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
         name: Part(int(lines[m]), every[gone[all_marker[gone] == m]], times[first][~there[:, m]])
         for m, name in enumerate(names)
     }
-    seen, account = _judged(place_of_kept, times, position[order], marker, account)
+    seen, account = intake.judge_markers(place_of_kept, times, position[order], marker, account)
     account = replace(account, parts=parts)
     position[order[~seen]] = np.nan
     position = by_frame(position)
@@ -96,30 +96,6 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
         latency_ns=description.latency_ns(about, "markers", place),
     )
     return stream, account
-
-
-def _judged(
-    place: Place, times: Times, position: Floats, marker: Indices, account: Intake
-) -> tuple[Flags, Intake]:
-    """Which lines are of a marker that is seen; the others are masked, by reason."""
-    blank, finite = np.asarray(np.isnan(position).all(axis=1)), intake.whole(position)
-    order = np.lexsort((times, marker))
-    order = order[finite[order]]
-    there = position[order]
-    again = np.zeros(len(position), bool)
-    same = (there[1:] == there[:-1]).all(axis=1) & (np.diff(marker[order]) == 0)
-    again[order[1:][same]] = True
-    reasons = {
-        "blank": blank,
-        "not finite": ~finite,
-        "missing marker (zeros)": finite & np.asarray((position == 0.0).all(axis=1)),
-        "beyond any tracker": intake.huge(position),
-    }
-    if not intake.rounded(position[finite]):
-        reasons["suspicious (position repeated exactly)"] = again
-    seen, account = intake.mask_first(place, times, account, reasons)
-    intake.need_usable(place, seen, account, "line", "a run in which markers are seen")
-    return seen, account
 
 
 def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:

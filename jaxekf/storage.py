@@ -32,8 +32,8 @@ from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_folder
 from jaxekf.hashes import hashed
-from jaxekf.intake import without_repeats
 from jaxekf.recording import Floats, Imu, Optical, Recording, Times
+from jaxekf.repeats import without_repeats
 from jaxekf.rows import Intake, Reason
 from jaxekf.tables import (
     POSITION,
@@ -67,8 +67,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         made = containers.load(path, sort=sort)
         made = made.replace(sources=made.sources or hashed(path))
     else:
-        made = _load_folder(Path(path), sort)
-    made = without_repeats(made)
+        made = without_repeats(_load_folder(Path(path), sort))
     if made.info.get("trust_units") is not True:
         plausible.require(made)
     return made

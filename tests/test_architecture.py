@@ -29,6 +29,7 @@ ORDER = [
         "container_layout",
         "container_files",
         "container_streams",
+        "repeats",
     ),
     ("containers",),
     ("alignment", "plausible"),

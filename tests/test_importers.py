@@ -4,6 +4,7 @@ import gzip
 import inspect
 import json
 import os
+from functools import partial
 
 import numpy as np
 import pytest
@@ -275,6 +276,21 @@ def test_vicon_quaternions(write):
     )
     np.testing.assert_allclose(recording.need_optical().position[0], [1.0, 0, 0])
     assert any("x, y, z, w" in text for text in recording.info["assumptions"])
+
+
+@pytest.mark.parametrize(
+    ("load", "lines"),
+    [(partial(ndi.load, tool="Probe"), TOOLS), (vicon.load, QUATERNIONS), (optitrack.load, MOTIVE)],
+)
+def test_rows_out_of_order_are_refused_or_sorted(write, load, lines):
+    """A row that came late, refused with advice that the command does not take, or put where it stands."""
+    whole = load(write(lines)).need_optical()
+    late = write([*lines[:-2], lines[-1], lines[-2]])
+    with pytest.raises(RecordingError, match="--sort"):
+        load(late)
+    optical = load(late, sort=True).need_optical()
+    np.testing.assert_array_equal(optical.time_ns, whole.time_ns)
+    np.testing.assert_array_equal(optical.position, whole.position)
 
 
 # ---------------------------------------------------------------------------------------------

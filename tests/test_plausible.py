@@ -123,6 +123,16 @@ def test_the_likelier_reading_is_named_first():
             plausible.require(make(run))
 
 
+@pytest.mark.parametrize("said", ["w,x,y,z,reference to body", "reference to body"])
+def test_advice_says_order_and_direction_however_they_were_written(said):
+    """Would catch advice that leaves a word of what was stated in the order's place."""
+    run = tool_pose(1)
+    with pytest.raises(RecordingError, match='quaternion = "w,x,y,z, body to reference"'):
+        plausible.require(
+            stated(run, said).replace(optical=turned(run, lambda q: q * CONJUGATE).optical)
+        )
+
+
 def test_markers_in_millimetres():
     """A geometry that is called another tool's where only the unit is another."""
     motion = simulate_tool.free_tool_motion(1)

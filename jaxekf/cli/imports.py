@@ -52,7 +52,11 @@ _LIST = "\n".join(f"  {name:<10} {one.about}" for name, one in FORMATS.items())
     type=click.Choice(["header", "receive"]),
     help="ros: the headers' stamps, or when the recorder got each message.  [default: header]",
 )
-@click.option("--sort", is_flag=True, help="ros: put messages in order that are not.")
+@click.option(
+    "--sort",
+    is_flag=True,
+    help="Put rows or messages in order of time that are not (not asl, broad, repoimu, adis).",
+)
 @overwrite_option
 @json_option
 def import_run(

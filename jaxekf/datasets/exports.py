@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxekf import intake
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Flags, Floats, Optical, Times
+from jaxekf.recording import Flags, Floats, Optical, Recording, Times
 from jaxekf.rows import Indices, Intake, Place, Reason
 
 METRES = {"m": 1.0, "meters": 1.0, "cm": 0.01, "centimeters": 0.01, "mm": 1e-3, "millimeters": 1e-3}
@@ -346,3 +346,11 @@ def pose_stream(
         source.rows.place, source.time_ns, quaternion, position, also=also, **said
     )
     return optical, accounted(account, source)
+
+
+def tracker_alone(
+    path: Path | str, otherwise: str, optical: Optical, account: Intake, info: dict[str, Any]
+) -> Recording:
+    """A run of a tracker without an IMU, named after its file, or `otherwise`."""
+    name = Path(path).name.split(".")[0] or otherwise
+    return Recording(name, optical=optical, info=info, path=Path(path), intake={"optical": account})

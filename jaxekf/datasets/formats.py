@@ -66,15 +66,17 @@ FORMATS: Mapping[str, Format] = {
     "ndi": Format(
         ndi.load,
         "NDI tracker, CSV export (tool by --tool): a tracker alone",
-        ("tool", "rate_hz", "status_ok"),
+        ("tool", "rate_hz", "status_ok", "sort"),
     ),
     "optitrack": Format(
-        optitrack.load, "OptiTrack Motive, CSV export of rigid bodies: a tracker alone", ("tool",)
+        optitrack.load,
+        "OptiTrack Motive, CSV export of rigid bodies: a tracker alone",
+        ("tool", "sort"),
     ),
     "vicon": Format(
         vicon.load,
         "Vicon Nexus or Tracker, CSV export of segments or objects: a tracker alone",
-        ("tool",),
+        ("tool", "sort"),
     ),
     "asl": Format(
         _one_asl, "EuRoC, TUM-VI and others in the ASL layout: tracker and IMU", ("imu", "pose")

@@ -32,6 +32,7 @@ from jaxekf.datasets.exports import (
     read_lines,
     stripped,
     timed,
+    tracker_alone,
     unit_of,
 )
 from jaxekf.errors import RecordingError
@@ -70,14 +71,15 @@ def load(
     tool: str | None = None,
     rate_hz: float | None = None,
     status_ok: Sequence[str] = STATUS_OK,
+    sort: bool = False,
 ) -> Recording:
     """The poses of one tool, as a run of a tracker alone.
 
     `tool` is its name or its port (``Probe``, ``Port 1``); it may be left out where there is only one.
     Times are the tracker's stamps; without any they are frame numbers over `rate_hz` (60 Hz unless given).
     `status_ok` are words or numbers of the state that mean a good pose. A lost tool (blank cells, a state,
-    -3.7e28, the identity at the origin) is masked by what it was lost for. Raises `RecordingError`, which
-    names file, line and column.
+    -3.7e28, the identity at the origin) is masked by what it was lost for. With `sort` rows that are out of
+    order are put in order of time. Raises `RecordingError`, which names file, line and column.
     """
     lines = read_lines(path, _WHAT)
     at = lines.find(_POSE, _WHAT)
@@ -98,7 +100,7 @@ def load(
     if group.state is not None:
         said |= {"status": source.rows.words(group.state), "status_ok": status_ok}
     position = np.where(np.abs(values[:, 4:]) < LARGEST, metres * values[:, 4:], values[:, 4:])
-    optical, account = pose_stream(source, values[:, :4], position, **said)
+    optical, account = pose_stream(source, values[:, :4], position, sort=sort, **said)
     words = ", ".join(status_ok)
     info = {
         "dataset": "NDI CSV",
@@ -117,13 +119,7 @@ def load(
             "Which way is up is not in the file: gravity_ref is not set.",
         ],
     }
-    return Recording(
-        Path(path).name.split(".")[0] or "ndi",
-        optical=optical,
-        info=info,
-        path=Path(path),
-        intake={"optical": account},
-    )
+    return tracker_alone(path, "ndi", optical, account, info)
 
 
 # ---------------------------------------------------------------------------------------------

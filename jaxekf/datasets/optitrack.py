@@ -18,6 +18,7 @@ from jaxekf.datasets.exports import (
     read_lines,
     stripped,
     timed,
+    tracker_alone,
 )
 from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Recording
@@ -41,13 +42,14 @@ class _Header(NamedTuple):
     """Such as ``rotation x`` or ``mean marker error``, in lower case."""
 
 
-def load(path: Path | str, *, tool: str | None = None) -> Recording:
+def load(path: Path | str, *, tool: str | None = None, sort: bool = False) -> Recording:
     """The poses of one rigid body, as a run of a tracker alone.
 
     `tool` is its name; it may be left out where there is only one. Times are those of the column
     ``Time (Seconds)``, exactly. Blank cells are occlusions. The mean marker error, where it was exported,
-    is the reported fit error. Raises `RecordingError`, which names file, line and column, also for
-    rotations that are not quaternions, units of length that are not metric, and poses that are not global.
+    is the reported fit error. With `sort` rows that are out of order are put in order of time. Raises
+    `RecordingError`, which names file, line and column, also for rotations that are not quaternions, units
+    of length that are not metric, and poses that are not global.
     """
     lines = read_lines(path, _WHAT)
     facts = _facts(lines)
@@ -65,7 +67,7 @@ def load(path: Path | str, *, tool: str | None = None) -> Recording:
     if error is not None:
         said["error"] = metres * source.rows.floats([error], ["Mean Marker Error"])[:, 0]
     optical, account = pose_stream(
-        source, np.roll(values[:, :4], 1, axis=1), metres * values[:, 4:], **said
+        source, np.roll(values[:, :4], 1, axis=1), metres * values[:, 4:], sort=sort, **said
     )
     rate = facts.get("export frame rate", facts.get("capture frame rate", ""))
     info: dict[str, Any] = {
@@ -87,13 +89,7 @@ def load(path: Path | str, *, tool: str | None = None) -> Recording:
         info["capture_start_time"] = facts["capture start time"]
     if rate:
         info["export_frame_rate"] = rate
-    return Recording(
-        Path(path).name.split(".")[0] or "motive",
-        optical=optical,
-        info=info,
-        path=Path(path),
-        intake={"optical": account},
-    )
+    return tracker_alone(path, "motive", optical, account, info)
 
 
 def _facts(lines: Lines) -> dict[str, str]:

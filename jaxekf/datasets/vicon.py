@@ -20,6 +20,7 @@ from jaxekf.datasets.exports import (
     read_lines,
     stripped,
     timed,
+    tracker_alone,
 )
 from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Floats, Recording, from_scipy
@@ -30,12 +31,13 @@ _VECTOR, _QUATERNION, _PLACE = ("rx", "ry", "rz"), ("rx", "ry", "rz", "rw"), ("t
 _ANGLES = {"rad": 1.0, "deg": np.pi / 180.0}
 
 
-def load(path: Path | str, *, tool: str | None = None) -> Recording:
+def load(path: Path | str, *, tool: str | None = None, sort: bool = False) -> Recording:
     """The poses of one object or segment, as a run of a tracker alone.
 
     `tool` is its name in the export (``Subject:Segment``, or the part behind the colon); it may be left out
     where there is only one. Times are frame numbers over the section's rate, in seconds. ``RX,RY,RZ`` is a
     rotation vector (helical angles), with ``RW`` a quaternion x, y, z, w. Blank cells are occlusions.
+    With `sort` rows that are out of order are put in order of time.
     Raises `RecordingError`, which names file, line and column.
     """
     lines = read_lines(path, _WHAT)
@@ -56,6 +58,7 @@ def load(path: Path | str, *, tool: str | None = None) -> Recording:
         source,
         _attitude(source.rows, group, angle),
         metres * source.rows.floats([group[n] for n in _PLACE], [n.upper() for n in _PLACE]),
+        sort=sort,
     )
     info = {
         "dataset": "Vicon CSV",
@@ -76,13 +79,7 @@ def load(path: Path | str, *, tool: str | None = None) -> Recording:
             "Which way is up is not in the file: gravity_ref is not set.",
         ],
     }
-    return Recording(
-        Path(path).name.split(".")[0] or "vicon",
-        optical=optical,
-        info=info,
-        path=Path(path),
-        intake={"optical": account},
-    )
+    return tracker_alone(path, "vicon", optical, account, info)
 
 
 def _section(lines: Lines) -> int:

@@ -32,7 +32,7 @@ from jaxekf.encoder_storage import joint_attitude
 from jaxekf.errors import RecordingError
 from jaxekf.files import whole_folder
 from jaxekf.hashes import hashed
-from jaxekf.recording import Floats, Imu, Optical, Recording, Times
+from jaxekf.recording import Imu, Optical, Recording, Times
 from jaxekf.repeats import without_repeats
 from jaxekf.rows import Intake, Reason
 from jaxekf.tables import (
@@ -49,6 +49,7 @@ from jaxekf.tables import (
     write_sheet,
 )
 
+_GYROSCOPE, _FORCE, _FIELD = ("gx", "gy", "gz"), ("ax", "ay", "az"), ("mx", "my", "mz")
 __all__ = ["SCHEMA_VERSION", "joint_attitude", "load", "load_imu", "save"]
 
 
@@ -208,8 +209,12 @@ def _read_optical(table: Table, source: Source) -> tuple[Optical, Intake]:
     turning = stated.turning("optical", about, place)
     _, length = stated.factors("optical", about, place)
     position = p_body_tool = status = None
+    names = list(turning.columns(table.columns))
     if set(POSITION) <= set(table.columns):
-        position = length * numbers(table, POSITION, blank=True)
+        names += POSITION
+    pose = numbers(table, names, blank=True)
+    if len(names) > 4:
+        position = length * pose[:, 4:]
     if "status" in table.columns:
         status = words(table, "status")
     if "p_body_tool" in about:
@@ -220,7 +225,7 @@ def _read_optical(table: Table, source: Source) -> tuple[Optical, Intake]:
     return intake.optical(
         table.place,
         stamps(table),
-        turning.standard(numbers(table, turning.columns(table.columns), blank=True)),
+        turning.standard(pose[:, :4]),
         position,
         status=status,
         status_ok=description.words(about, "optical", "status_ok", intake.STATUS_OK, place),
@@ -253,27 +258,28 @@ def _read_imu(table: Table, source: Source) -> tuple[Imu, Intake]:
     need_columns(table, "time,gx,gy,gz[,ax,ay,az][,mx,my,mz]")
     rate, force = stated.factors("imu", source.about, source.place)
 
-    def maybe(names: tuple[str, ...]) -> Floats | None:
-        return numbers(table, names, blank=True) if set(names) <= set(table.columns) else None
-
-    accelerometer = maybe(("ax", "ay", "az"))
+    parts = [_GYROSCOPE, *(p for p in (_FORCE, _FIELD) if set(p) <= set(table.columns))]
+    # All at once: a file is taken apart only once for them.
+    every = numbers(table, [name for part in parts for name in part], blank=True)
+    read = {part: every[:, 3 * i : 3 * i + 3] for i, part in enumerate(parts)}
+    accelerometer = read.get(_FORCE)
     return intake.imu(
         table.place,
         stamps(table),
-        rate * numbers(table, ("gx", "gy", "gz"), blank=True),
+        rate * read[_GYROSCOPE],
         None if accelerometer is None else force * accelerometer,
-        maybe(("mx", "my", "mz")),
+        read.get(_FIELD),
         sort=source.sort,
     )
 
 
 def _write_imu(stream: Imu, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
-    columns, values = ["gx", "gy", "gz"], [stream.gyroscope]
+    columns, values = list(_GYROSCOPE), [stream.gyroscope]
     if stream.accelerometer is not None:
-        columns += ["ax", "ay", "az"]
+        columns += _FORCE
         values.append(stream.accelerometer)
     if stream.magnetometer is not None:
-        columns += ["mx", "my", "mz"]
+        columns += _FIELD
         values.append(stream.magnetometer)
     about |= _FORMS["imu"].described
     return Sheet(columns, stream.time_ns, np.concatenate(values, axis=1)), about

@@ -183,7 +183,9 @@ def need_time(table: Table) -> None:
 def numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
     """Columns as float64 (N, len(names)); with `blank`, empty cells are NaN."""
     at = [table.columns.index(name) for name in names]
-    raw = _nan_for_blank(table.text.data) if blank else table.text.data
+    raw = table.text.data
+    if blank and table.text.has_blank:
+        raw = _nan_for_blank(raw)
     try:
         return np.loadtxt(
             io.TextIOWrapper(io.BytesIO(raw), "utf-8"),

@@ -8,6 +8,7 @@ import csv
 import hashlib
 import io
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +20,8 @@ from jaxekf.rows import Indices
 
 _BLOCK = 1 << 22
 _COMMA, _NEWLINE = ord(","), ord("\n")
+_BLANKS = tuple(b"\n \t")
+"""With which a line that holds nothing begins."""
 _HIDDEN = str.maketrans({",": "\x1f", "\n": "\x1e", "\r": "\x1e"})
 """What stands for a delimiter or a line's end within a quoted cell."""
 _SHOWN = str.maketrans({"\x1f": ",", "\x1e": "\n"})
@@ -60,6 +63,12 @@ class Text(NamedTuple):
         first = np.zeros(len(self.ends), np.int64)
         first[1:] = self.ends[:-1, -1] + 1
         return first
+
+    @property
+    def has_blank(self) -> bool:
+        """Whether some cell has nothing in it, not even a blank."""
+        flat = self.ends.reshape(-1)
+        return bool(flat[0] == 0 or (np.diff(flat) == 1).any())
 
     def cell(self, row: int, column: int) -> str:
         """One cell, without blanks around it."""
@@ -232,9 +241,12 @@ def _names(line: bytes) -> list[str]:
 
 def _without_blank_lines(raw: bytes, first: int) -> tuple[bytes, Indices]:
     """The rows without lines that hold nothing, and the number of the line of each."""
-    count = raw.count(b"\n")
-    lines = np.arange(first, first + count)
-    if not (raw.startswith(b"\n") or b"\n\n" in raw or b"\n " in raw or b"\n\t" in raw):
+    newlines = _positions(raw, lambda block: block == _NEWLINE)
+    lines = np.arange(first, first + len(newlines))
+    flat = np.frombuffer(raw, np.uint8)
+    begins = flat[np.concatenate([[0], newlines[:-1] + 1])] if len(newlines) else flat[:0]
+    # Looked up where lines begin: to search the whole of a long file for each blank is slow.
+    if not np.isin(begins, _BLANKS).any():
         return raw, lines
     rows = raw[:-1].split(b"\n")
     kept = np.array([bool(row.strip()) for row in rows], bool)
@@ -242,19 +254,22 @@ def _without_blank_lines(raw: bytes, first: int) -> tuple[bytes, Indices]:
     return b"\n".join([*left, b""]) if left else b"", lines[kept]
 
 
+def _positions(
+    raw: bytes, found: Callable[[NDArray[np.uint8]], NDArray[np.bool_]]
+) -> NDArray[np.int64]:
+    """Where bytes are of a kind; in blocks, for a mask of the whole file would be as large as the file."""
+    flat = np.frombuffer(raw, np.uint8)
+    blocks = [
+        np.flatnonzero(found(flat[start : start + _BLOCK])) + start
+        for start in range(0, len(flat), _BLOCK)
+    ]
+    return np.concatenate(blocks) if blocks else np.zeros(0, np.int64)
+
+
 def _cell_ends(raw: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Where cells end, and how many cells each line has."""
-    flat = np.frombuffer(raw, np.uint8)
-    found, widths, before = [], [], 0
-    # In blocks, for a mask of the whole file would be as large as the file.
-    for start in range(0, len(flat), _BLOCK):
-        block = flat[start : start + _BLOCK]
-        at = np.flatnonzero((block == _COMMA) | (block == _NEWLINE))
-        found.append(at + start)
-        last = np.flatnonzero(block[at] == _NEWLINE) + before
-        widths.append(last)
-        before += len(at)
-    ends, last = np.concatenate(found), np.concatenate(widths)
+    ends = _positions(raw, lambda block: (block == _COMMA) | (block == _NEWLINE))
+    last = np.flatnonzero(np.frombuffer(raw, np.uint8)[ends] == _NEWLINE)
     return ends, np.diff(last, prepend=-1)
 
 

@@ -65,8 +65,8 @@ def optical(
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns, SLOWEST_TRACKER_S)
-    quaternion = quaternion[order]
-    position = None if position is None else position[order]
+    quaternion = chosen(quaternion, order)
+    position = None if position is None else chosen(position, order)
     error = None if error is None else error[order]
     reasons: dict[str, Flags] = {} if hidden is None else {"hidden": hidden[order]}
     if status is not None:
@@ -119,9 +119,11 @@ def imu(
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
-    needed = [a[order] for a in (gyroscope, accelerometer) if a is not None]
-    bad = ~whole(np.concatenate(needed, axis=1))
-    far = huge(np.concatenate(needed, axis=1))
+    bad, far = np.zeros(len(order), bool), np.zeros(len(order), bool)
+    for needed in (gyroscope, accelerometer):
+        if needed is not None:
+            bad |= ~whole(chosen(needed, order))
+            far |= huge(chosen(needed, order))
     valid, account = mask_first(
         place, time_ns, account, {"not finite": bad, "beyond any sensor": far}
     )
@@ -129,8 +131,10 @@ def imu(
         raise place.error(
             None, None, f"no finite row among {account.rows}", "at least one", "recording again"
         )
-    chosen = order[valid]
-    streams = [None if a is None else a[chosen] for a in (gyroscope, accelerometer, magnetometer)]
+    streams = [
+        None if a is None else chosen(a, order[valid])
+        for a in (gyroscope, accelerometer, magnetometer)
+    ]
     gyro, *others = streams
     assert gyro is not None
     assert account.numbers is not None
@@ -305,10 +309,16 @@ def need_usable(place: Place, valid: Flags, account: Intake, what: str, hint: st
         raise place.error(None, None, got, "at least one", hint)
 
 
+def chosen(values: NDArray[Any], rows: Indices) -> NDArray[Any]:
+    """Some rows of values (N, ...); the values themselves, no copy, where that is all of them in order."""
+    every = len(rows) == len(values) and bool((rows == np.arange(len(rows))).all())
+    return values if every else values[rows]
+
+
 def huge(values: Floats) -> Flags:
     """Rows (N,) of values (N, c) of which some are beyond what is measured."""
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(values) > _BEYOND).any(axis=1))
+        return np.asarray(((values > _BEYOND) | (values < -_BEYOND)).any(axis=1))
 
 
 def whole(values: Floats) -> Flags:

@@ -163,6 +163,11 @@ def factors(label: str, about: Mapping[str, Any], place: Path | str) -> tuple[fl
     return (*told, *[1.0] * (len(known) - len(told)))
 
 
+def scaled(values: Floats, factor: float) -> Floats:
+    """Numbers in SI; the same array, no copy, where they are."""
+    return values if factor == 1.0 else factor * values
+
+
 def turning(label: str, about: Mapping[str, Any], place: Path | str) -> Turning:
     """Order and direction of a stream's quaternions, ``quaternion = "w,x,y,z, body to reference"``."""
     value = about.get("quaternion", BODY_TO_REFERENCE)

@@ -261,13 +261,14 @@ def _read_imu(table: Table, source: Source) -> tuple[Imu, Intake]:
     parts = [_GYROSCOPE, *(p for p in (_FORCE, _FIELD) if set(p) <= set(table.columns))]
     # All at once: a file is taken apart only once for them.
     every = numbers(table, [name for part in parts for name in part], blank=True)
-    read = {part: every[:, 3 * i : 3 * i + 3] for i, part in enumerate(parts)}
+    read = {p: np.ascontiguousarray(every[:, 3 * i : 3 * i + 3]) for i, p in enumerate(parts)}
+    del every
     accelerometer = read.get(_FORCE)
     return intake.imu(
         table.place,
         stamps(table),
-        rate * read[_GYROSCOPE],
-        None if accelerometer is None else force * accelerometer,
+        stated.scaled(read[_GYROSCOPE], rate),
+        None if accelerometer is None else stated.scaled(accelerometer, force),
         read.get(_FIELD),
         sort=source.sort,
     )

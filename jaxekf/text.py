@@ -105,7 +105,7 @@ def read_text(
         raw, number = raw[end + 1 :], number + 1
     while raw[:1] == b"\n":
         raw, number = raw[1:], number + 1
-    if not raw.strip():
+    if not raw or raw.isspace():
         raise RecordingError(
             path, "an empty file", "a header and samples", "exporting the run again"
         )

@@ -45,6 +45,8 @@ class Samples:
     """How long after `time_ns` a sample was known."""
     origin: tuple[str, ...] = ()
     """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
+    thinned: int = 0
+    """Samples of that stream that are left out here because so many tell nothing more."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,8 @@ class Recording:
     imu: Imu | None = None
     encoder: Encoder | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Facts: ``gravity_ref`` (free fall, m/s^2, reference frame), ``p_body_object`` and
+    """Facts: ``gravity_ref`` (free fall, m/s^2, reference frame), ``field_ref`` (magnetic north there),
+    ``p_body_object`` and
     ``q_body_object`` (the point and frame of the tool that is asked for), licence, seed."""
     path: Path | None = None
     markers: Markers | None = None

@@ -30,6 +30,7 @@ RUN_KEYS = (
     "sha256",
     "trust_units",
     "gravity_ref",
+    "field_ref",
     "p_body_object",
     "q_body_object",
 )

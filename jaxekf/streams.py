@@ -29,12 +29,13 @@ def count(samples: Samples, start: int, end: int) -> dict[str, int]:
     """The account of a stream in a run from `start` to `end`, ns."""
     inside = (samples.time_ns >= start) & (samples.time_ns <= end)
     shown = visible(samples)
-    return {
-        "read": len(samples.time_ns),
+    account = {
+        "read": len(samples.time_ns) + samples.thinned,
         "fed": int((inside & shown).sum()),
         "masked": int((inside & ~shown).sum()),
         "dropped_outside_run": int((~inside).sum()),
     }
+    return account | ({"dropped_thinned": samples.thinned} if samples.thinned else {})
 
 
 def of_rows(

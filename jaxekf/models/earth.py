@@ -1,0 +1,85 @@
+"""The Earth's gravity and magnetic field as references of attitude: what `triad` and `marg` share.
+
+Up and magnetic north are those that a recording states: ``gravity_ref`` (free fall, by default along -z)
+and ``field_ref``, of which only the horizontal direction counts (by default y: x to the east, y to magnetic
+north, z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. How far
+the field dips below the horizontal, and how strong it is, is found from each recording.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxekf import inclination
+from jaxekf.errors import RecordingError
+from jaxekf.recording import Flags, Floats, Imu, Recording
+from jaxekf.rows import Indices
+
+GRAVITY_REF = (0.0, 0.0, -9.80665)
+FIELD_REF = (0.0, 1.0, 0.0)
+MOST_HZ = 100.0
+"""Samples of a magnetometer that are used in a second: what is wrong with the field lasts longer."""
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run."""
+
+    gravity_ref: Any
+    """(3,) free fall in the reference frame, m/s^2."""
+    field_ref: Any
+    """(3,) unit vector along the magnetic field in the reference frame."""
+
+
+def dipping(up: Floats, north: Floats, dip: float) -> Floats:
+    """(3,) unit vector `dip` radians below a horizontal unit vector."""
+    return np.cos(dip) * north - np.sin(dip) * up
+
+
+SETUP = Setup(
+    np.array(GRAVITY_REF), dipping(np.array([0.0, 0.0, 1.0]), np.array(FIELD_REF), np.deg2rad(60.0))
+)
+
+
+def need_both(recording: Recording) -> Imu:
+    """The IMU, or an error that says which of its sensors is not there."""
+    imu = recording.need_imu()
+    for name, columns in (("accelerometer", "ax,ay,az"), ("magnetometer", "mx,my,mz")):
+        values = getattr(imu, name)
+        if values is None or not np.isfinite(values).all(axis=1).any():
+            raise RecordingError(
+                recording.path or recording.name,
+                f"an IMU without {name}",
+                "gyroscope, accelerometer and magnetometer for this model",
+                f"adding {columns} to imu.csv, or the model loose where there is a tracker",
+            )
+    return imu
+
+
+def setup(recording: Recording) -> Setup:
+    """Up and north as a recording states them, and the field's dip as it is felt in the run.
+
+    Raises `RecordingError` where the stated field is vertical, so that it has no north.
+    """
+    gravity = np.asarray(recording.info.get("gravity_ref", GRAVITY_REF), float)
+    stated = np.asarray(recording.info.get("field_ref", FIELD_REF), float)
+    up = -gravity / np.linalg.norm(gravity)
+    level = stated - up * (up @ stated)
+    if np.linalg.norm(level) < 1e-6 * np.linalg.norm(stated):
+        raise RecordingError(
+            recording.path or recording.name,
+            f"field_ref = {stated.tolist()}, along gravity_ref",
+            "a field with a horizontal part, which points to magnetic north",
+            "correcting field_ref or gravity_ref in recording.toml",
+            column="field_ref",
+        )
+    dip = float(np.nanmedian(inclination.field(need_both(recording)).dip))
+    return Setup(gravity, dipping(up, level / np.linalg.norm(level), dip))
+
+
+def thinned(imu: Imu, good: Flags) -> Indices:
+    """Rows of an IMU that are good (N,), so many that `MOST_HZ` is kept, spread evenly."""
+    rows = np.flatnonzero(good)
+    if len(rows) < 2:
+        return rows
+    step = float(np.median(np.diff(imu.time_ns[rows])))
+    return rows[:: max(1, round(1e9 / (step * MOST_HZ)))]

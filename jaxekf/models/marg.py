@@ -1,0 +1,313 @@
+"""`marg`: attitude from gyroscope, accelerometer and magnetometer alone, tunable.
+
+The better version of Ang, Khosla and Riviere's filter (`triad`), where no tracker is. Three things make it
+so, each of them a parameter that a tuner may set:
+
+- The accelerometer does not measure gravity: it is an input, integrated to a velocity, and a *pseudo-
+  measurement* says that the velocity is near zero. That is a low-pass in Kalman form, of the order and
+  corner that the data want, and what gravity is follows from it.
+- The magnetometer is a direction (in units of the field's strength) whose noise grows with what norm and
+  dip are off: a disturbed field is mostly of another size or slope as well.
+- At rest the gyroscope reads its bias.
+
+12 degrees of freedom. Gyroscope and accelerometer are inputs, so that nothing is held.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import inclination, linalg, rotation, vectors
+from jaxekf.interpolation import InputSample
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Input, Model, Output, Parameters, Sensor, Start
+from jaxekf.models import earth, sources
+from jaxekf.models.inertial import block_diagonal
+from jaxekf.recording import NANOSECONDS, Recording, Samples
+
+START_S = 0.1
+"""Seconds whose mean gives the attitude to start from."""
+
+
+class State(NamedTuple):
+    """Attitude in the reference frame, velocity there, and what the gyroscope measures wrongly."""
+
+    q_ref_body: Any
+    velocity: Any
+    bias: Any
+    scale: Any
+    """Of the gyroscope's axes, beside 1."""
+
+
+class Noise(NamedTuple):
+    """What is random: leaves of shape () or, but for the magnetometer's, (3,) or (3, 3)."""
+
+    gyroscope: Any
+    """White noise of the rate, spectral density."""
+    bias_walk: Any
+    """Random walk of the bias, spectral density of its derivative."""
+    accelerometer: Any
+    """White noise of the specific force, spectral density."""
+    velocity: Any
+    """By what the body's velocity is not zero, spectral density."""
+    rest: Any
+    """White noise of the rate at rest, spectral density: how well rest tells the bias."""
+    magnetometer: Any
+    """Of a field that has norm and dip of the undisturbed, share of its norm, spectral density; ()."""
+    norm: Any
+    """The same for each unit that the norm is off, as a share; ()."""
+    dip: Any
+    """The same for each radian that the dip is off; ()."""
+
+
+class Calibration(NamedTuple):
+    """What is not random: ``rate = (1 + scale) * (gyroscope_matrix @ (measured - bias))``."""
+
+    gyroscope_matrix: Any
+    """Scale, non-orthogonality and alignment, (3, 3)."""
+    accelerometer_bias: Any
+    """(3,) m/s^2."""
+    clock_offset: Any
+    """Seconds to add to the time of truth and estimate to get the gyroscope's, positive where it lags."""
+    magnetometer_lag: Any
+    """Seconds by which a magnetometer's sample is older than the estimate it is compared with; ()."""
+    declination: Any
+    """Radians from the stated north to that of the field, positive to the east; ()."""
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    attitude: Any
+    """About that of accelerometer and magnetometer at the start."""
+    velocity: Any
+    """About zero, as bias and scale."""
+    bias: Any
+    scale: Any
+
+
+SPACE: Any = State(
+    SO3(),
+    Euclidean(3, "m/s", frame="reference"),
+    Euclidean(3, "rad/s"),
+    Euclidean(3, "1"),
+)
+
+
+def body_rate(x: State, measured: Array, params: Parameters) -> Array:
+    """The rate (3,) of a gyroscope's reading (the first three numbers)."""
+    return (1.0 + x.scale) * (params.calibration.gyroscope_matrix @ (measured[:3] - x.bias))
+
+
+def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
+    """Strapdown integration of the mean rate and specific force over ``dt``, as in `inertial`.
+
+    ``w`` holds angle, velocity and the change of the bias.
+    """
+    force = u.mean[3:] - params.calibration.accelerometer_bias
+    turn = body_rate(x, u.mean, params) * dt
+    once = jnp.cross(turn, force)
+    twice = jnp.cross(turn, once)
+    gained = (force + once / 2.0 + twice / 6.0) * dt + w[3:6]
+    return State(
+        SO3().retract(x.q_ref_body, turn + w[:3]),
+        x.velocity + params.setup.gravity_ref * dt + rotation.rotate(x.q_ref_body, gained),
+        x.bias + w[6:],
+        x.scale,
+    )
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (9, 9) of angle, velocity and bias noise over ``dt``."""
+    noise = params.noise
+    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk)
+    return dt * block_diagonal([linalg.covariance(d, 3) for d in densities])
+
+
+def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
+    """The field's direction in the body as it was when the magnetometer took it."""
+    gravity, declination = params.setup.gravity_ref, params.calibration.declination
+    fall = gravity / jnp.sqrt(jnp.sum(gravity * gravity))
+    field = rotation.rotate(rotation.exp(declination * fall), params.setup.field_ref)
+    before = body_rate(x, u.value, params) * params.calibration.magnetometer_lag
+    return rotation.rotate(rotation.exp(before), rotation.rotate_inverse(x.q_ref_body, field))
+
+
+def magnetometer_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3); `aux` is by what norm (a share) and dip (rad) of the sample are off."""
+    noise = params.noise
+    off = noise.magnetometer**2 + (noise.norm * aux[0]) ** 2 + (noise.dip * aux[1]) ** 2
+    return off / dt * jnp.eye(3)
+
+
+def predict_velocity(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
+    """The velocity, to be held near zero."""
+    return x.velocity
+
+
+def velocity_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of a pseudo-measurement every ``dt``."""
+    return linalg.covariance(params.noise.velocity, 3) / dt
+
+
+def predict_rest(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
+    """What the gyroscope reads at rest: its bias, whatever its scale."""
+    return x.bias
+
+
+def rest_noise(params: Parameters, aux: Any, dt: Array) -> Array:
+    """Covariance (3, 3) of readings averaged over ``dt``."""
+    return linalg.covariance(params.noise.rest, 3) / dt
+
+
+def magnetometer(recording: Recording) -> Samples:
+    """The field (N, 3) in units of its median norm, and by what norm and dip are off."""
+    imu = earth.need_both(recording)
+    assert imu.magnetometer is not None
+    field = inclination.field(imu)
+    good = np.isfinite(field.dip)
+    rows = earth.thinned(imu, good)
+    norm, dip = np.nanmedian(field.norm), np.nanmedian(field.dip)
+    aux = np.stack([np.abs(field.norm[rows] / norm - 1.0), np.abs(field.dip[rows] - dip)], axis=1)
+    left = int(good.sum()) - len(rows)
+    every = np.ones(len(rows), bool)
+    value = imu.magnetometer[rows] / norm
+    return Samples(imu.time_ns[rows], value, every, aux, origin=("imu",), thinned=left)
+
+
+def velocity(recording: Recording) -> Samples:
+    """Zeros (N, 3) at the instants of the pseudo-measurement, those of the magnetometer if it is fast."""
+    imu = earth.need_both(recording)
+    rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
+    return Samples(imu.time_ns[rows], np.zeros((len(rows), 3)), np.ones(len(rows), bool))
+
+
+def rest(recording: Recording) -> Samples:
+    """Mean rates (N, 3) since the instant before, visible where the IMU rests."""
+    imu = earth.need_both(recording)
+    rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyroscope, axis=0)])
+    before = np.concatenate([[-1], rows[:-1]])
+    mean = (total[rows + 1] - total[before + 1]) / (rows - before)[:, None]
+    return Samples(imu.time_ns[rows], mean, inclination.still(imu)[rows])
+
+
+def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
+    """The first magnetometer sample that gives an attitude with the specific force about it."""
+    imu, about = earth.need_both(recording), earth.setup(recording)
+    assert imu.accelerometer is not None and imu.magnetometer is not None
+    for time_ns in samples["magnetometer"].time_ns:
+        near = (imu.time_ns >= time_ns) & (imu.time_ns <= time_ns + int(START_S * NANOSECONDS))
+        force, field = imu.accelerometer[near].mean(axis=0), imu.magnetometer[near]
+        found = vectors.triad(
+            jnp.asarray(force),
+            jnp.asarray(np.nanmean(field, axis=0)),
+            jnp.asarray(-about.gravity_ref),
+            jnp.asarray(about.field_ref),
+        )
+        if bool(found.valid):
+            return Start(int(time_ns), {"q_ref_body": np.asarray(found.q_ref_body)})
+    return None
+
+
+def initial_mean(first: Mapping[str, Any]) -> State:
+    """The attitude found at the start (the identity if there is none), all else zero."""
+    q = jnp.asarray(first.get("q_ref_body", rotation.identity()))
+    zero = jnp.zeros(3, q.dtype)
+    return State(q, zero, zero, zero)
+
+
+def initial_covariance(params: Parameters) -> Array:
+    """Covariance (12, 12)."""
+    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
+
+
+def rate_noise(u: InputSample, params: Parameters) -> Array:
+    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    matrix = params.calibration.gyroscope_matrix
+    return linalg.congruence(matrix, linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth)
+
+
+DEFAULTS = Parameters(
+    Noise(
+        gyroscope=np.deg2rad(0.06),
+        bias_walk=np.deg2rad(0.005),
+        accelerometer=0.03,
+        velocity=0.1,
+        rest=np.deg2rad(0.02),
+        magnetometer=0.05,
+        norm=0.5,
+        dip=0.4,
+    ),
+    Calibration(
+        gyroscope_matrix=np.eye(3),
+        accelerometer_bias=np.zeros(3),
+        clock_offset=np.array(0.0),
+        magnetometer_lag=np.array(0.0),
+        declination=np.array(0.0),
+    ),
+    Initial(attitude=np.deg2rad(10.0), velocity=0.1, bias=np.deg2rad(0.3), scale=0.003),
+    earth.SETUP,
+)
+
+UNITS = Parameters(
+    Noise(
+        "rad/s/sqrt(Hz)",
+        "rad/s^2/sqrt(Hz)",
+        "m/s^2/sqrt(Hz)",
+        "m/s/sqrt(Hz)",
+        "rad/s/sqrt(Hz)",
+        "1/sqrt(Hz)",
+        "1/sqrt(Hz)",
+        "1/rad/sqrt(Hz)",
+    ),
+    Calibration("1", "m/s^2", "s", "s", "rad"),
+    Initial("rad", "m/s", "rad/s", "1"),
+)
+
+MODEL = Model(
+    name="marg",
+    summary="attitude from gyroscope, accelerometer and magnetometer alone",
+    space=SPACE,
+    transition=transition,
+    process_noise=process_noise,
+    sensors=(
+        Sensor(
+            "magnetometer",
+            Euclidean(3, "1"),
+            predict_magnetometer,
+            magnetometer_noise,
+            magnetometer,
+            aux_like=np.zeros(2),
+        ),
+        Sensor(
+            "velocity",
+            Euclidean(3, "m/s", frame="reference"),
+            predict_velocity,
+            velocity_noise,
+            velocity,
+        ),
+        Sensor("rest", Euclidean(3, "rad/s"), predict_rest, rest_noise, rest),
+    ),
+    parameters=DEFAULTS,
+    units=UNITS,
+    noise_dims=Noise(3, 3, 3, 3, 3, 1, 1, 1),
+    initial_mean=initial_mean,
+    initial_covariance=initial_covariance,
+    find_start=find_start,
+    setup=earth.setup,
+    input=Input("imu", sources.imu, lambda params: params.calibration.clock_offset),
+    outputs=(
+        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+        Output(
+            "rate",
+            Euclidean(3, "rad/s"),
+            "body",
+            lambda x, u, params: body_rate(x, u.value, params),
+            rate_noise,
+        ),
+    ),
+)

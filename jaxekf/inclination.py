@@ -7,7 +7,7 @@ estimate takes an attitude from it.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import butter, lfilter, lfilter_zi
+from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from jaxekf.recording import NANOSECONDS, Flags, Floats, Imu, period_ns
 
@@ -49,9 +49,9 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     force = _rotate(q, imu.accelerometer)
     rate = NANOSECONDS / max(period_ns(imu.time_ns), 1)
     corner = min(np.sqrt(2.0) / (2.0 * np.pi * settling_s), 0.4 * rate)
-    b, a = butter(2, corner, fs=rate)
+    sos = butter(2, corner, fs=rate, output="sos")
     first = force[: max(1, int(0.1 * rate))].mean(axis=0)
-    smooth, _ = lfilter(b, a, force, axis=0, zi=lfilter_zi(b, a)[:, None] * first)
+    smooth, _ = sosfilt(sos, force, axis=0, zi=sosfilt_zi(sos)[:, :, None] * first)
     inside = _rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), smooth)
     return inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
 
@@ -59,7 +59,8 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
 def still(imu: Imu) -> Flags:
     """(N,) whether the IMU has rested for the last second: readings scatter as little as they ever do.
 
-    What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise is.
+    What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise
+    is.
     """
     width = max(2, int(_STILL_S * NANOSECONDS / max(period_ns(imu.time_ns), 1)))
     quiet = _quiet(imu.gyroscope, width, _STILL_RATE)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from jaxekf.errors import ModelError
 from jaxekf.model import Model
-from jaxekf.models import loose, loose_additive, loose_pose, loose_rate, marg, tight
+from jaxekf.models import loose, loose_additive, loose_pose, loose_rate, marg, tight, triad
 from jaxekf.recording import Recording
 
 REGISTRY: dict[str, Model] = {
@@ -18,6 +18,7 @@ REGISTRY: dict[str, Model] = {
         loose_additive.MODEL,
         loose_pose.MODEL,
         tight.MODEL,
+        triad.MODEL,
         marg.MODEL,
     )
 }

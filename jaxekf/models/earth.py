@@ -1,8 +1,8 @@
 """The Earth's gravity and magnetic field as references of attitude: what `triad` and `marg` share.
 
 Up and magnetic north are those that a recording states: ``gravity_ref`` (free fall, by default along -z)
-and ``field_ref``, of which only the horizontal direction counts (by default y: x to the east, y to magnetic
-north, z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. How far
+and ``field_ref``, of which only the horizontal direction counts (by default y: x is east then, y is north,
+z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. How far
 the field dips below the horizontal, and how strong it is, is found from each recording.
 """
 

@@ -41,6 +41,34 @@ def attitude_error(q: Floats, truth: Floats) -> Floats:
     return (to_scipy(q).inv() * to_scipy(truth)).as_rotvec()
 
 
+class OrientationError(NamedTuple):
+    """Root mean squares of the angle between estimate and truth, and of its two parts, in degrees."""
+
+    total_deg: float
+    heading_deg: float
+    """Of its turn about the vertical."""
+    inclination_deg: float
+    """Of what is left: the least turn that puts the vertical right."""
+
+
+def orientation_error(
+    q: Floats, truth: Floats, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> OrientationError:
+    """Errors of quaternions (N, 4), body to reference, as BROAD counts them (Laidig et al. 2021).
+
+    `up` is the vertical in the reference frame. No offset of the heading is taken off.
+    """
+    off = (to_scipy(q) * to_scipy(truth).inv()).as_quat()
+    vertical = np.asarray(up) / np.linalg.norm(up)
+    about, scalar = np.abs(off[:, :3] @ vertical), np.abs(off[:, 3])
+    total = 2.0 * np.arccos(np.clip(scalar, 0.0, 1.0))
+    heading = 2.0 * np.arctan2(about, scalar)
+    inclination = 2.0 * np.arccos(np.clip(np.hypot(about, scalar), 0.0, 1.0))
+    return OrientationError(
+        *(float(np.rad2deg(np.sqrt(np.mean(a**2)))) for a in (total, heading, inclination))
+    )
+
+
 def rms(values: Floats) -> float:
     """Root of the mean square of the lengths of vectors (N, d); NaN rows do not count."""
     squared = np.sum(np.asarray(values) ** 2, axis=-1)

@@ -25,6 +25,7 @@ from jaxekf.recording import (
     Recording,
     Times,
     from_scipy,
+    to_scipy,
 )
 from jaxekf.timeline import Steps
 
@@ -46,6 +47,15 @@ class SensorGrade:
     optical_hz: float = 62.5
     imu_hz: float = 125.0
     encoder_hz: float = 125.0
+    accelerometer: float | None = None
+    """White noise of the specific force, m/s^2/sqrt(Hz); None for an IMU without."""
+    magnetometer: float | None = None
+    """Noise of the field per axis, share of its norm; None for an IMU without."""
+
+
+GRAVITY_REF = (0.0, 0.0, -9.80665)
+FIELD_REF = (0.0, 0.5, -0.5 * np.sqrt(3.0))
+"""The magnetic field that a simulated IMU feels: north along y, 60 deg below the horizontal."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +153,15 @@ def recording(
     if joint:
         axis = [float(r != 0.0) for r in motion.rate]
         info["encoder_about"] = {"axis": axis, "acts_on": "reference"}
+    if grade.accelerometer is not None:
+        info["gravity_ref"] = list(GRAVITY_REF)
+    if grade.magnetometer is not None:
+        info["field_ref"] = list(FIELD_REF)
+    optical = _optical(motion, grade, rng, duration_s, occlusions, dropouts, start_ns, marker_body)
     return Recording(
         name,
-        _optical(motion, grade, rng, duration_s, occlusions, dropouts, start_ns, marker_body),
-        _imu(motion, grade, rng, duration_s, start_ns),
+        optical,
+        _earth(motion, grade, seed, _imu(motion, grade, rng, duration_s, start_ns)),
         _encoder(motion, grade, duration_s, start_ns),
         info,
     )
@@ -192,6 +207,24 @@ def _imu(
     bias = bias + np.cumsum(step * rng.standard_normal((len(t), 3)), axis=0)
     white = np.deg2rad(grade.gyroscope_deg) * np.sqrt(grade.imu_hz)
     return Imu(times, rate + bias + white * rng.standard_normal((len(t), 3)))
+
+
+def _earth(motion: Motion, grade: SensorGrade, seed: int, imu: Imu) -> Imu:
+    """The IMU with what it feels of gravity and field; it stands where the tool turns about."""
+    rng = np.random.default_rng([seed, 1])
+    q, _ = motion.attitude(seconds(imu.time_ns))
+    into_body = to_scipy(q).inv()
+
+    def felt(vector: Sequence[float], deviation: float) -> Floats:
+        return into_body.apply(vector) + deviation * rng.standard_normal((len(q), 3))
+
+    force = field = None
+    if grade.accelerometer is not None:
+        up = [-g for g in GRAVITY_REF]
+        force = felt(up, grade.accelerometer * np.sqrt(grade.imu_hz))
+    if grade.magnetometer is not None:
+        field = felt(FIELD_REF, grade.magnetometer)
+    return Imu(imu.time_ns, imu.gyroscope, force, field)
 
 
 def _encoder(motion: Motion, grade: SensorGrade, duration_s: float, start_ns: int) -> Encoder:

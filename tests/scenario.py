@@ -254,12 +254,15 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
     noise = 0.01 * rng.standard_normal((len(t), 3))
     gyroscope = scale * (motion.rate(t) + BIAS + noise)
     up = Rotation.from_rotvec(motion.vector(t)).inv().apply([0.0, 0.0, 9.81])
+    field = np.array([0.0, 0.5, -0.8])
+    magnetic = Rotation.from_rotvec(motion.vector(t)).inv().apply(field)
+    magnetic += scale * 0.02 * rng.standard_normal((len(t), 3))
     gravity = np.array([0.0, 0.0, -9.81])
     if turn is not None:
         rotation = Rotation.from_quat(np.roll(turn, -1))
         q = from_scipy(rotation * Rotation.from_quat(np.roll(q, -1, axis=1)))
         gyroscope = rotation.apply(gyroscope) if turn_rate else gyroscope
-        gravity = rotation.apply(gravity)
+        gravity, field = rotation.apply(gravity), rotation.apply(field)
         exact = from_scipy(rotation * rotation_of(exact))
     valid = np.ones(len(q), bool)
     valid[1 + seed % 5] = False
@@ -269,7 +272,6 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
     visible = valid[:, None] & np.ones((1, 3), bool)
     visible[1 + (seed + 2) % 5, 1] = False
     markers = Markers(start_ns + optical_ns, seen, visible, ("1", "2", "3"), ARMS)
-    info = {"gravity_ref": gravity.tolist()}
-    return Recording(
-        "simulated", optical, Imu(start_ns + imu_ns, gyroscope, up), None, info, markers=markers
-    )
+    info = {"gravity_ref": gravity.tolist(), "field_ref": field.tolist()}
+    imu = Imu(start_ns + imu_ns, gyroscope, up, magnetic)
+    return Recording("simulated", optical, imu, None, info, markers=markers)

@@ -17,7 +17,7 @@ from jaxekf.model import Belief, Model
 from jaxekf.models import REGISTRY
 from jaxekf.timeline import Rows, Steps
 
-TOYS = {model.name: model for model in (toy_models.MARKERS, toy_models.TRIAD, toy_models.VISUAL)}
+TOYS = {model.name: model for model in (toy_models.MARKERS, toy_models.VISUAL)}
 MODELS = REGISTRY | TOYS
 
 
@@ -49,7 +49,15 @@ def data(model, seed, rest=False):
     recording = scenario.recording(seed, rest=rest)
     line = timeline.build(model, recording)
     mean = scenario.as_arrays(model.initial_mean(line.first))
-    return Data(mean, line.steps, timeline.build(model, recording, slow=()).steps)
+    flat = timeline.build(model, recording, slow=()).steps
+    return Data(mean, *(rested(steps) for steps in (line.steps, flat)))
+
+
+def rested(steps):
+    """The steps with some of the samples that only a tool at rest has shown as well."""
+    for rows in [sensors["rest"] for sensors in (steps.fast, steps.slow) if "rest" in sensors]:
+        rows.mask[2::4] = True
+    return steps
 
 
 def start(model, params, mean):
@@ -300,9 +308,10 @@ def test_one_compilation(model):
     assert np.any(first != second)
 
 
-@every_model
-def test_many_runs(model):
+@pytest.mark.parametrize("name", scenario.long_form(list(MODELS), {"loose_pose", "marg"}))
+def test_many_runs(name):
     """Runs that leak into each other, or lanes that are transposed on the way in or out."""
+    model = MODELS[name]
     params = parameters(model)
     runs = []
     for seed in (0, 1, 2):
@@ -331,7 +340,10 @@ def renamed(model):
     return dataclasses.replace(model, sensors=sensors), names
 
 
-@pytest.mark.parametrize("name", [k for k, model in MODELS.items() if len(model.sensors) > 1])
+SEVERAL = [name for name, model in MODELS.items() if len(model.sensors) > 1]
+
+
+@pytest.mark.parametrize("name", scenario.long_form(SEVERAL, {"marg"}))
 def test_order_of_sensors(name):
     """A sensor that is linearised at a state which another has already moved."""
     model, params = MODELS[name], parameters(MODELS[name])

@@ -1,8 +1,7 @@
 """Models of other systems, each written as a user would: the core fits them unchanged.
 
-`MARKERS` fuses single optical markers with an IMU as input, `TRIAD` a computed attitude with a
-rate, `VISUAL` point correspondences with an IMU as measurement. `linear_model` is a plain Kalman
-filter.
+`MARKERS` fuses single optical markers with an IMU as input, `VISUAL` point correspondences with an IMU
+as measurement. `linear_model` is a plain Kalman filter.
 """
 
 from typing import Any, NamedTuple
@@ -117,53 +116,6 @@ MARKERS = Model(
     ),
     initial_covariance=lambda params: _diagonal(*params.initial),
     input=Input("imu", _no_recording),
-)
-
-
-# An attitude computed by TRIAD and a rate as input: 7 numbers, 6 degrees of freedom.
-
-
-class TriadState(NamedTuple):
-    q_ref_body: Any
-    rate_bias: Any
-
-
-class TriadNoise(NamedTuple):
-    rate: Any
-    bias_walk: Any
-    attitude_scale: Any
-
-
-class TriadInitial(NamedTuple):
-    attitude: Any
-    bias: Any
-
-
-def _triad_transition(x, u, dt, w, params):
-    turn = (u.mean - x.rate_bias) * dt + w[:3]
-    return TriadState(SO3().retract(x.q_ref_body, turn), x.rate_bias + w[3:])
-
-
-TRIAD = Model(
-    name="triad",
-    summary="attitude from two directions, rate as input",
-    space=TriadState(SO3(), Euclidean(3, "rad/s")),
-    transition=_triad_transition,
-    process_noise=lambda params, dt: _diagonal(params.noise.rate, params.noise.bias_walk) * dt,
-    sensors=(
-        Sensor(
-            "attitude",
-            SO3(),
-            lambda x, u, params, aux: x.q_ref_body,
-            lambda params, aux, dt: params.noise.attitude_scale**2 * aux,
-        ),
-    ),
-    parameters=Parameters(TriadNoise(0.01, 0.001, 1.2), Empty(), TriadInitial(0.2, 0.02)),
-    units=Parameters(Empty(), Empty(), Empty()),
-    noise_dims=TriadNoise(3, 3, 1),
-    initial_mean=lambda first: TriadState(rotation.exp(jnp.array([0.5, 0.1, -0.8])), jnp.zeros(3)),
-    initial_covariance=lambda params: _diagonal(*params.initial),
-    input=Input("rate", _no_recording),
 )
 
 
@@ -327,13 +279,12 @@ def linear_model(transition, input_noise, slopes, noises, gate=None):
 EPOCHS, SUBSTEPS = 6, 2
 
 
-def _imu_knots(seed, rest, channels):
+def _imu_knots(seed, rest, channels=6):
     rng = np.random.default_rng([seed, 11])
     time = np.arange(-0.01, 0.26, 0.01)
     turn = time[:, None] * rng.uniform(5.0, 15.0, channels) + rng.uniform(0.0, 6.0, channels)
     value = np.zeros_like(turn) if rest else 0.8 * np.sin(turn)
-    if channels == 6:
-        value[:, :3] += [0.0, 0.0, 9.81]
+    value[:, :3] += [0.0, 0.0, 9.81]
     areas = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]
     integral = np.concatenate([np.zeros((1, channels)), np.cumsum(areas, axis=0)])
     return Knots(time, value, integral)
@@ -342,9 +293,6 @@ def _imu_knots(seed, rest, channels):
 def _aux(model, sensor, rng, lead):
     if model is MARKERS:
         return rng.uniform(0.5, 1.0, lead)
-    if model is TRIAD:
-        factor = 0.01 * (np.eye(3) + 0.3 * np.tril(rng.standard_normal((*lead, 3, 3))))
-        return factor @ np.swapaxes(factor, -1, -2)
     if sensor.name == "camera":
         place = rng.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 5.0], (*lead, 4, 3))
         return Landmarks(place, rng.uniform(0.002, 0.004, (*lead, 4)))
@@ -358,7 +306,7 @@ def _skeleton(model, seed, rest):
     valid = np.ones_like(dt, bool)
     dt[0, 0], valid[0, 0] = 0.0, False
     time = np.cumsum(dt.reshape(-1)).reshape(dt.shape)
-    slow_names = {"camera", "attitude"} | {f"marker_{i}" for i in range(3)}
+    slow_names = {"camera"} | {f"marker_{i}" for i in range(3)}
     rows = {}
     for sensor in model.sensors:
         lead = (EPOCHS,) if sensor.name in slow_names else (EPOCHS, SUBSTEPS)
@@ -373,8 +321,7 @@ def _skeleton(model, seed, rest):
         rows[sensor.name] = Rows(None, aux, mask, np.full(lead, 0.01))
     fast = {name: row for name, row in rows.items() if name not in slow_names}
     slow = {name: row for name, row in rows.items() if name in slow_names}
-    channels = {"markers": 6, "triad": 3}.get(model.name)
-    knots = None if channels is None else _imu_knots(seed, rest, channels)
+    knots = _imu_knots(seed, rest) if model is MARKERS else None
     return Steps(time, dt, valid, knots, fast, slow)
 
 

@@ -140,7 +140,6 @@ DEFAULTS = Parameters(
     ),
     Calibration(clock_offset=np.array(0.0)),
     Initial(attitude=np.deg2rad(10.0), bias=np.deg2rad(1.0)),
-    earth.SETUP,
 )
 
 UNITS = Parameters(
@@ -171,7 +170,6 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=initial_covariance,
     start_with=("attitude",),
-    setup=earth.setup,
     input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
     outputs=(
         Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),

@@ -1,0 +1,293 @@
+"""Orientation from gyroscope, accelerometer and magnetometer of BROAD trials, tuned, beside other filters.
+
+    python examples/broad_orientation.py DIR --train 01 05 10 16 28 32 --test 02 07 12 24 35
+
+DIR holds BROAD's MATLAB files. The model `marg` is tuned by gradient on the training trials alone, against
+their motion capture, and estimates the test trials, filtered and smoothed. Beside it stand VQF and its
+offline form (from PyPI), and Madgwick's and Mahony's filters (from `ahrs`, gains tuned on the training
+trials too):
+
+    pip install "jaxekf[bench]"
+
+Errors are BROAD's: root mean squares over the samples of `movement` of the whole angle between estimate and
+truth, of its turn about the vertical (heading) and of the rest (inclination); no heading offset is removed.
+Frames were checked against the truth: Madgwick's filter of `ahrs` gives north, west, up, all others east,
+north, up. The last line printed is JSON: means over the test trials, and each trial's.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import track  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+import jaxekf  # noqa: E402
+import tuning  # noqa: E402
+from jaxekf import optional  # noqa: E402
+from jaxekf.datasets import broad  # noqa: E402
+from jaxekf.metrics import OrientationError, orientation_error  # noqa: E402
+from jaxekf.models import marg  # noqa: E402
+from jaxekf.recording import Floats, Imu, Times, to_scipy  # noqa: E402
+from jaxekf.truth import encoder_at  # noqa: E402
+
+FREE = (
+    "noise",
+    "calibration.clock_offset",
+    "calibration.magnetometer_lag",
+    "calibration.accelerometer_bias",
+    "calibration.declination",
+)
+ITERATIONS = 12
+CONSOLE = Console(stderr=True)
+COARSE = 3
+"""Samples of a training trial that are averaged: a third of the work, and the tuned densities do not depend
+on the rate."""
+MADGWICK = (0.01, 0.02, 0.05, 0.1, 0.2)
+MAHONY = (0.1, 0.25, 0.5, 1.0, 2.0)
+SHARES = (0.0, 0.03, 0.3)
+"""Mahony's gains of the integral, as shares of the proportional ones."""
+NORTH_WEST_UP = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""From north, west, up to east, north, up."""
+
+
+class Gains(NamedTuple):
+    """Of a filter of `ahrs`."""
+
+    kind: str
+    proportional: float
+    integral: float = 0.0
+
+
+# ---------------------------------------------------------------------------------------------
+# Ours
+
+
+def coarse(trial: jaxekf.Recording) -> jaxekf.Recording:
+    """A trial whose IMU is averaged over `COARSE` samples; a field that turns is taken from the middle."""
+    imu = trial.need_imu()
+    count = len(imu.time_ns) // COARSE
+    middle = np.arange(count) * COARSE + COARSE // 2
+
+    def mean(values: Floats | None) -> Floats | None:
+        if values is None:
+            return None
+        return values[: count * COARSE].reshape(count, COARSE, 3).mean(axis=1)
+
+    gyroscope = mean(imu.gyroscope)
+    assert gyroscope is not None and imu.magnetometer is not None
+    field = imu.magnetometer[middle]
+    return trial.replace(imu=Imu(imu.time_ns[middle], gyroscope, mean(imu.accelerometer), field))
+
+
+def tuned_on(trials: Sequence[jaxekf.Recording], iterations: int) -> tuning.Tuned:
+    """The model's noise and calibration, such that the truth is likely under the estimate."""
+
+    def progress(step: tuning.Iteration, total: int) -> None:
+        if sys.stderr.isatty():
+            print(
+                f"\r  step {step.number + 1}/{total}: {step.training:.4f}", end="", file=sys.stderr
+            )
+
+    return tuning.tune(
+        [coarse(trial) for trial in trials],
+        model=marg.MODEL,
+        objective="truth",
+        free=FREE,
+        iterations=iterations,
+        progress=progress,
+    )
+
+
+# ---------------------------------------------------------------------------------------------
+# The others
+
+
+def vqf(imu: Imu, *, offline: bool) -> Floats:
+    """Quaternions (N, 4) of VQF (Laidig and Seel 2023), filtered or offline; its default parameters."""
+    package = optional.need("vqf", "bench")
+    streams = [
+        np.ascontiguousarray(a) for a in (imu.gyroscope, imu.accelerometer, imu.magnetometer)
+    ]
+    period = float(np.mean(np.diff(imu.time_ns))) * 1e-9
+    if offline:
+        return package.offlineVQF(*streams, period)["quat9D"]
+    return package.VQF(period).updateBatch(*streams)["quat9D"]
+
+
+def start_of(trial: jaxekf.Recording) -> Floats:
+    """The attitude (4,) that our own filter starts from, for all."""
+    found = marg.find_start(trial, {"magnetometer": marg.magnetometer(trial)})
+    assert found is not None
+    return np.asarray(found.first["q_ref_body"])
+
+
+def by_ahrs(gains: Gains, imu: Imu, start: Floats) -> Floats:
+    """Quaternions (N, 4), east, north, up, of a filter of `ahrs` from the attitude (4,) it starts at."""
+    filters = optional.need("ahrs.filters", "bench")
+    rate = 1e9 / float(np.mean(np.diff(imu.time_ns)))
+    if gains.kind == "madgwick":
+        made = filters.Madgwick(frequency=rate, gain=gains.proportional)
+        q = product(NORTH_WEST_UP * np.array([1.0, 1.0, 1.0, -1.0]), start)
+    else:
+        made = filters.Mahony(frequency=rate, k_P=gains.proportional, k_I=gains.integral)
+        q = start
+    found = np.empty((len(imu.time_ns), 4))
+    assert imu.accelerometer is not None and imu.magnetometer is not None
+    for i, sample in enumerate(
+        zip(imu.gyroscope, imu.accelerometer, imu.magnetometer, strict=True)
+    ):
+        q = made.updateMARG(q, *sample)
+        found[i] = q
+    if gains.kind == "madgwick":
+        found = product(NORTH_WEST_UP, found)
+    return found
+
+
+def product(p: Floats, q: Floats) -> Floats:
+    """Quaternion (4,) times quaternions (..., 4)."""
+    return (to_scipy(p) * to_scipy(q)).as_quat(scalar_first=True)
+
+
+def ahrs_error(gains: Gains, imu: Imu, start: Floats, truth: jaxekf.Encoder) -> OrientationError:
+    """Error of a filter of `ahrs` on one trial."""
+    return scored(by_ahrs(gains, imu, start), imu.time_ns, truth)
+
+
+def scored(q: Floats, time_ns: Times, truth: jaxekf.Encoder) -> OrientationError:
+    """Error of quaternions (N, 4) at these instants."""
+    at = encoder_at(truth, time_ns)
+    return orientation_error(q[at.scored], at.q_ref_body[at.scored])
+
+
+def of_all(
+    trials: Sequence[jaxekf.Recording], gains: Sequence[Gains], what: str
+) -> dict[Gains, list[OrientationError]]:
+    """Errors of filters of `ahrs`, which take 200 us a sample in Python, with each of these gains on each
+    trial; side by side."""
+    tasks = [(g, t.need_imu(), start_of(t), t.need_encoder()) for g in gains for t in trials]
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        waiting = [pool.submit(ahrs_error, *task) for task in tasks]
+        for _ in track(as_completed(waiting), what, len(waiting), console=CONSOLE, transient=True):
+            pass
+    found: dict[Gains, list[OrientationError]] = {g: [] for g in gains}
+    for (g, *_), done in zip(tasks, waiting, strict=True):
+        found[g].append(done.result())
+    return found
+
+
+def best(trials: Sequence[jaxekf.Recording], gains: Sequence[Gains]) -> Gains:
+    """Those gains whose error is least, in the mean of the trials."""
+    found = of_all(trials, gains, f"gains of {gains[0].kind}")
+    return min(found, key=lambda g: mean(found[g]).total_deg)
+
+
+def mean(errors: Sequence[OrientationError]) -> OrientationError:
+    """Means over trials."""
+    return OrientationError(*np.mean(np.array(errors), axis=0).tolist())
+
+
+# ---------------------------------------------------------------------------------------------
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--train", nargs="+", required=True, metavar="TRIAL")
+    parser.add_argument("--test", nargs="+", required=True, metavar="TRIAL")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--alone", action="store_true", help="leave the other filters out")
+    return parser.parse_args()
+
+
+def ours(
+    trials: Sequence[jaxekf.Recording], params: jaxekf.Parameters
+) -> dict[str, list[OrientationError]]:
+    """Errors of the tuned model on each trial, filtered and smoothed."""
+    found = {}
+    for name, smooth in (("filtered", False), ("smoothed", True)):
+        made = jaxekf.estimate_many(trials, marg.MODEL, params, smooth=smooth)
+        found[name] = [
+            scored(one.outputs["attitude"].value, one.time_ns, trial.need_encoder())
+            for one, trial in zip(made, trials, strict=True)
+        ]
+    return found
+
+
+def theirs(
+    training: Sequence[jaxekf.Recording], testing: Sequence[jaxekf.Recording]
+) -> tuple[dict[str, list[OrientationError]], dict[str, Gains]]:
+    """Errors of the other filters on each test trial, and the gains that were found."""
+    found: dict[str, list[OrientationError]] = {}
+    for name, offline in (("vqf", False), ("offline_vqf", True)):
+        found[name] = [
+            scored(vqf(t.need_imu(), offline=offline), t.need_imu().time_ns, t.need_encoder())
+            for t in testing
+        ]
+    chosen = {"madgwick": best(training, [Gains("madgwick", g) for g in MADGWICK])}
+    first = best(training, [Gains("mahony", g, SHARES[1] * g) for g in MAHONY])
+    chosen["mahony"] = best(
+        training, [first._replace(integral=s * first.proportional) for s in SHARES]
+    )
+    for name, gains in chosen.items():
+        found[name] = of_all(testing, [gains], name)[gains]
+    return found, chosen
+
+
+def show(found: dict[str, list[OrientationError]], names: Sequence[str]) -> None:
+    """A table of the whole error of each trial, and the means of all three."""
+    table = Table("", *names, "mean", "heading", "inclination", title="RMSE, deg")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for method, errors in found.items():
+        cells = [f"{e.total_deg:.2f}" for e in errors] + [f"{value:.2f}" for value in mean(errors)]
+        table.add_row(method.replace("_", " "), *cells)
+    Console().print(table)
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    began = time.perf_counter()
+    training, testing = (
+        [broad.load(broad.find(arguments.folder, trial)) for trial in trials]
+        for trials in (arguments.train, arguments.test)
+    )
+    tuned = tuned_on(training, arguments.iterations)
+    seconds = time.perf_counter() - began
+    found = ours(testing, tuned.params)
+    gains: dict[str, Gains] = {}
+    if not arguments.alone:
+        others, gains = theirs(training, testing)
+        found |= others
+    show(found, arguments.test)
+    print(f"tuned in {len(tuned.history)} steps, {seconds:.0f} s: {tuned.stopped}")
+    noise, calibration = tuned.params.noise, tuned.params.calibration
+    for part in (noise, calibration):
+        told = {k: np.round(np.asarray(v, float), 5).tolist() for k, v in part._asdict().items()}
+        print("  " + ", ".join(f"{name} {value}" for name, value in told.items()))
+    document: dict[str, Any] = {
+        "trials": arguments.test,
+        "mean": {name: mean(errors)._asdict() for name, errors in found.items()},
+        "total_deg": {name: [e.total_deg for e in errors] for name, errors in found.items()},
+        "gains": {name: one._asdict() for name, one in gains.items()},
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    print(json.dumps(document))
+
+
+if __name__ == "__main__":
+    main()

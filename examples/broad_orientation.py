@@ -54,8 +54,8 @@ FREE = (
 )
 ITERATIONS = 12
 CONSOLE = Console(stderr=True)
-COARSE = 3
-"""Samples of a training trial that are averaged: a third of the work, and the tuned densities do not depend
+COARSE = 6
+"""Samples of a training trial that are averaged: a sixth of the work, and the tuned densities do not depend
 on the rate."""
 MADGWICK = (0.01, 0.02, 0.05, 0.1, 0.2)
 MAHONY = (0.1, 0.25, 0.5, 1.0, 2.0)

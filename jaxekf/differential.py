@@ -6,7 +6,8 @@ omega(t - T)) / T``, which leaves ``omega(t)`` as three unknowns whose residuals
 
 The rate is integrated, so its error is too: it goes on by `RateEstimate.transition` at each sample,
 which grows or decays with rate and geometry: with six axes and rates of 20 rad/s by many powers of
-ten in seconds, with twelve by far less. Something else, such as an attitude, must bound it.
+ten in seconds, with twelve by far less. Something else, such as an attitude, must bound it, or
+the rate is led back to zero as it goes (`forget_s` of `track`).
 """
 
 from typing import NamedTuple
@@ -151,12 +152,19 @@ def track(
     start_rate: Array,
     interval: Array | float,
     start_covariance: Array | None = None,
+    forget_s: Array | float | None = None,
 ) -> RateEstimate:
     """Angular velocity at every sample of `readings` (N, n), m/s^2, each from the one before.
 
     `noise` as in `placement.differences`. `start_rate` (3,), rad/s, is the one an `interval` before the
     first sample; `interval`, s, is one number () or one for each sample (N,). With `start_covariance`
     (3, 3) the covariances are those of the whole way; without it, of each step.
+
+    With `forget_s`, (), s, the rate before is led back to zero with that time constant, so that error
+    does not add up for ever: white noise of the angular acceleration of density ``d``, rad/s^2/sqrt(Hz),
+    leaves ``d sqrt(forget_s / 2)`` in place of ``d sqrt(time)``; `covariance` is of that noise alone. The
+    part of the rate that is slower is missing; `restored` adds it again. Rates and errors of more than
+    some ``1 / forget_s`` that last make the recursion run away all the same.
     """
     readings, start_rate = jnp.asarray(readings), jnp.asarray(start_rate)
     n = jnp.shape(array.axes)[0]
@@ -171,7 +179,29 @@ def track(
         before: tuple[Array, Array | None], sample: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array | None], RateEstimate]:
         rate, cov = before
-        found = angular_rate(prepared, sample[0], rate, sample[1], cov)
+        if forget_s is None:
+            found = angular_rate(prepared, sample[0], rate, sample[1], cov)
+        else:
+            kept = jnp.exp(-sample[1] / forget_s)
+            cov = None if cov is None else kept * kept * cov
+            found = angular_rate(prepared, sample[0], kept * rate, sample[1], cov)
+            found = found._replace(transition=kept * found.transition)
         return (found.rate, None if cov is None else found.covariance), found
 
     return jax.lax.scan(advance, (start_rate, start_covariance), (readings, intervals))[1]
+
+
+def restored(
+    rate: Array, start_rate: Array, interval: Array | float, forget_s: Array | float
+) -> Array:
+    """Rates (N, 3), rad/s, of `track` with what it forgot added again; the other arguments as there.
+
+    They are the sums of the angular accelerations that the readings told, so that slow motion is whole
+    and noise is a random walk again. But the walk does not go back into the recursion: only the
+    centripetal part of each sample uses the rate that was led back. This is what suits a filter
+    that estimates a bias which walks.
+    """
+    rate = jnp.asarray(rate)
+    intervals = jnp.broadcast_to(jnp.asarray(interval, rate.dtype), rate.shape[:1])
+    before = jnp.concatenate([jnp.asarray(start_rate, rate.dtype)[None], rate[:-1]])
+    return rate - jnp.cumsum(jnp.expm1(-intervals / forget_s)[:, None] * before, axis=0)

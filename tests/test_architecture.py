@@ -64,6 +64,7 @@ ORDER = [
     ("signatures", "verdicts"),
     ("diagnostics",),
     ("simulate_tool",),
+    ("simulate_surgery",),
     ("datasets.columns", "datasets.exports", "datasets.bag_files"),
     ("datasets.bags",),
     ("datasets.ros_messages",),

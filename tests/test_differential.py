@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxekf import kernels
-from jaxekf.differential import angular_rate, track
+from jaxekf.differential import angular_rate, restored, track
 from jaxekf.placement import (
     AccelerometerArray,
     _left_out,
@@ -529,6 +529,86 @@ def test_derivative_of_a_track():
         near, far = (
             tracked_with_slope(case | {name: case[name] + k * d})[0][0]
             - tracked_with_slope(case | {name: case[name] - k * d})[0][0]
+            for k in (1, 2)
+        )
+        np.testing.assert_allclose(slope[name][place], (8 * near - far) / (12 * step), rtol=1e-6)
+
+
+def forgetting(case):
+    array = AccelerometerArray(case["positions"], case["axes"])
+    given = case["readings"], case["start"], case["interval"], case["cov"]
+    got = track(array, NOISE, *given, forget_s=case["forget"])
+    whole = restored(got.rate, case["start"], case["interval"], case["forget"])
+    weights = jnp.array([1.0, -2.0, 3.0])
+    return jnp.sum((got.rate[-1] + 2.0 * whole[-1]) * weights), (got, whole)
+
+
+forgetting_with_slope = kernels.jit(jax.value_and_grad(forgetting, has_aux=True))
+
+
+def test_forgotten_rate_is_restored():
+    """A rate led back at another pace, twice, or by the wrong sample's interval; what is added again not
+    what was taken. At such a part of a hand's rates that the
+    centripetal part does not count."""
+    case, rate = hand()
+    rate, forget = 1e-5 * rate, 0.05
+    rows = zip(rate[1:], np.diff(rate, axis=0) / case["interval"][:, None], strict=True)
+    readings = [law(case["positions"], case["axes"], *row, np.ones(3)) for row in rows]
+    slow = {"start": rate[0], "readings": np.stack(readings), "forget": np.array(forget)}
+    (_, (got, whole)), _ = forgetting_with_slope(case | slow | {"cov": np.zeros((3, 3))})
+    np.testing.assert_allclose(whole, rate[1:], rtol=0, atol=1e-8)
+    expected, before = [], rate[0]
+    for step, interval in zip(np.diff(rate, axis=0), case["interval"], strict=True):
+        before = before * np.exp(-interval / forget) + step
+        expected.append(before)
+    np.testing.assert_allclose(got.rate, expected, rtol=0, atol=1e-8)
+    assert np.abs(got.rate - rate[1:]).max() > 1e-5
+
+
+def test_forgetting_never_is_not_forgetting():
+    """An optional argument that changes more than it says."""
+    case = hand()[0] | {"cov": np.diag([1e-4, 2e-4, 3e-4])}
+    (_, plain), _ = tracked_with_slope(case)
+    (_, (got, whole)), _ = forgetting_with_slope(case | {"forget": np.array(1e15)})
+    for mine, theirs in zip(got[:4], plain[:4], strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(whole, plain.rate, rtol=0, atol=1e-9)
+
+
+def test_noise_of_a_forgetting_track():
+    """Error that is not held at ``d sqrt(forget_s / 2)``, in the rates or in their covariance; a transition
+    that leaves out what is forgotten."""
+    case, forget, interval, n = hand()[0], 0.1, 2e-3, 20_000
+    rng = np.random.default_rng(14)
+    array = AccelerometerArray(case["positions"], case["axes"])
+    readings = [9.8, 1.0, 2.0] @ case["axes"].T + 1e-7 * rng.normal(size=(n, 6))
+
+    @kernels.jit
+    def run(readings):
+        none = jnp.zeros(3)
+        return track(array, 1e-7, readings, none, interval, jnp.zeros((3, 3)), forget_s=forget)
+
+    got = run(readings)
+    step = np.array(got.covariance[0])
+    kept = np.exp(-interval / forget)
+    np.testing.assert_allclose(got.covariance[-1], step / (1.0 - kept**2), rtol=1e-3)
+    np.testing.assert_allclose(got.covariance[-1], step / interval * forget / 2, rtol=0.03)
+    np.testing.assert_allclose(got.transition[-1], kept * np.eye(3), rtol=0, atol=1e-4)
+    # Some 400 independent samples.
+    whitened = np.linalg.solve(np.linalg.cholesky(got.covariance[-1]), got.rate[500:].T)
+    np.testing.assert_allclose(whitened.std(axis=1), 1.0, rtol=0.15)
+
+
+def test_derivative_of_a_forgetting_track():
+    """A derivative that what is forgotten, or restored, does not pass on; by its time constant, too."""
+    case = hand()[0] | {"cov": np.zeros((3, 3)), "forget": np.array(0.3)}
+    _, slope = forgetting_with_slope(case)
+    for name, place in (("start", (2,)), ("interval", (3,)), ("readings", (7, 0)), ("forget", ())):
+        d = np.zeros_like(case[name])
+        d[place] = step = 1e-4 * float(np.abs(case[name]).max())
+        near, far = (
+            forgetting_with_slope(case | {name: case[name] + k * d})[0][0]
+            - forgetting_with_slope(case | {name: case[name] - k * d})[0][0]
             for k in (1, 2)
         )
         np.testing.assert_allclose(slope[name][place], (8 * near - far) / (12 * step), rtol=1e-6)

@@ -1,6 +1,7 @@
 """Up, rest and the Earth's field before any filter, and what a recording states of both."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -124,6 +125,16 @@ def test_up_takes_as_long_as_it_says():
         assert 1.3 * settling_s < late < 2.5 * settling_s
 
 
+def test_up_starts_from_a_tenth_of_a_second():
+    """A start from the first sample alone, which scatters, for as long as the low-pass takes."""
+    off = []
+    for seed in range(10):
+        imu = resting(100, (0.0, 1.0, 0.0), seed=seed)
+        up = np.tile(MOUNT.inv().apply(UP), (100, 1))
+        off.append(angles(inclination.up_in_body(imu), up)[:5])
+    assert np.sqrt(np.mean(np.square(off))) < 1.5 * np.sqrt(2.0 / 10.0) / GRAVITY
+
+
 def test_up_knows_nothing_of_what_comes():
     """A filter that runs backwards as well: what an estimate at an instant is judged by may not use later
     samples."""
@@ -153,6 +164,41 @@ def test_rest_is_told_from_motion():
     found = inclination.still(replace(level, accelerometer=force))
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 21.0].any()
+
+
+class Stopping(NamedTuple):
+    """A motion that ends at 40 s, all at once."""
+
+    motion: simulate.Motion
+
+    def attitude(self, t):
+        """As that of the motion."""
+        q, rate = self.motion.attitude(np.minimum(t, 40.0))
+        return q, np.where(t[:, None] < 40.0, rate, 0.0)
+
+
+def test_rest_is_found_again():
+    """A window that grows from the start of the run, in which the motion is for ever."""
+    motion = Stopping(simulate.free_motion(0, rest_s=20.0))
+    imu, _ = carried(motion, times(100.0, 60.0), 0.0, (2e-3, 0.02, 0.0))
+    t, found = simulate.seconds(imu.time_ns), inclination.still(imu)
+    assert found[((t > 1.0) & (t < 20.0)) | (t > 41.2)].mean() > 0.95
+    assert not found[(t > 20.5) & (t < 40.9)].any()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_gentle_and_quick_motion_is_none(axis):
+    """A bound that is not the sensor's own, or one that a tremor without rest sets itself; a motion about
+    one axis of which the others do not tell."""
+    time_ns = times(100.0, 60.0)
+    t, rng = simulate.seconds(time_ns), np.random.default_rng(axis)
+    own = 2e-4 * rng.standard_normal((len(t), 3))
+    moves = np.eye(3)[axis] * np.sqrt(2.0) * np.sin(2.0 * np.pi * 8.3 * t)[:, None]
+    gentle = own + np.where(t[:, None] > 20.0, np.deg2rad(0.3) * moves, 0.0)
+    found = inclination.still(Imu(time_ns, gentle))
+    assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
+    assert not found[t > 20.5].any()
+    assert not inclination.still(Imu(time_ns, own + np.deg2rad(3.0) * moves)).any()
 
 
 def test_a_run_that_never_rests():

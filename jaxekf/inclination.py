@@ -1,7 +1,7 @@
 """Which way is up in the body, when it rests, and how the magnetic field lies to it, before any filter.
 
-From the samples up to an instant alone. What is found here says how far a magnetometer is to be trusted; no
-estimate takes an attitude from it.
+From the samples up to an instant alone, but for what rest looks like, which the whole run tells. What is
+found here says how far a magnetometer is to be trusted; no estimate takes an attitude from it.
 """
 
 from typing import NamedTuple
@@ -18,6 +18,8 @@ _STILL_RATE, _STILL_FORCE = np.deg2rad(1.0), 0.3
 """rad/s and m/s^2: more than any sensor scatters at rest."""
 _QUIETEST, _LOUDER = 0.02, 1.6
 """Share of the seconds that rest at least, and by how much a scatter at rest may exceed theirs."""
+_LEAST = 0.05
+"""Share of what any sensor scatters that always is rest: readings may repeat to the last bit."""
 _SLOWEST_MEAN = np.deg2rad(2.0)
 """rad/s: a gyroscope that reads more on average turns, whatever its scatter."""
 
@@ -47,6 +49,8 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     assert imu.accelerometer is not None
     q = turned(imu)
     force = _rotate(q, imu.accelerometer)
+    if len(force) == 1:
+        return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
     rate = NANOSECONDS / max(period_ns(imu.time_ns), 1)
     corner = min(np.sqrt(2.0) / (2.0 * np.pi * settling_s), 0.4 * rate)
     sos = butter(2, corner, fs=rate, output="sos")
@@ -84,7 +88,9 @@ def field(imu: Imu) -> Field:
     """Norm and dip at each sample of a magnetometer; NaN where it was not read."""
     assert imu.magnetometer is not None
     norm = np.linalg.norm(imu.magnetometer, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    # Some write zeros for what they did not read.
+    norm = np.where(np.isfinite(norm) & (norm > 0.0), norm, np.nan)
+    with np.errstate(invalid="ignore"):
         down = -np.sum(imu.magnetometer * up_in_body(imu), axis=1) / norm
     return Field(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
 
@@ -95,7 +101,7 @@ def _quiet(values: Floats, width: int, most: float) -> Flags:
     spread = _trailing(values**2, width) - _trailing(values, width) ** 2
     deviation = np.sqrt(np.maximum(spread.max(axis=1), 0.0))
     own = np.quantile(deviation[width - 1 :], _QUIETEST) if len(values) >= width else 0.0
-    return deviation < min(_LOUDER * own, most)
+    return deviation < np.clip(_LOUDER * own, _LEAST * most, most)
 
 
 def _trailing(values: Floats, width: int) -> Floats:

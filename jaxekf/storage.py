@@ -185,6 +185,7 @@ def save(
     about |= {
         k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about
     }
+    stated.check_keys(about, "", description.FILE)
     about |= description.facts(about, description.FILE)
     with whole_folder(path, description.FILE, overwrite=overwrite) as folder:
         for label, form in _FORMS.items():

@@ -6,19 +6,22 @@ z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is 
 the field dips below the horizontal, and how strong it is, is found from each recording.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf import inclination
+from jaxekf import description, inclination
 from jaxekf.errors import RecordingError
-from jaxekf.recording import Flags, Floats, Imu, Recording
+from jaxekf.recording import NANOSECONDS, Flags, Floats, Imu, Recording
 from jaxekf.rows import Indices
 
 GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 1.0, 0.0)
 MOST_HZ = 100.0
 """Samples of a magnetometer that are used in a second: what is wrong with the field lasts longer."""
+_PAUSE_NS = 500_000_000
+"""A longer step is no sampling period."""
 
 
 class Setup(NamedTuple):
@@ -41,27 +44,36 @@ SETUP = Setup(
 
 
 def need_both(recording: Recording) -> Imu:
-    """The IMU, or an error that says which of its sensors is not there."""
+    """The IMU's samples whose rate and specific force are finite; its magnetometer may be slower.
+
+    Raises `RecordingError`, which says which of its sensors is not there: one that reads zeros only is not.
+    """
     imu = recording.need_imu()
     for name, columns in (("accelerometer", "ax,ay,az"), ("magnetometer", "mx,my,mz")):
         values = getattr(imu, name)
-        if values is None or not np.isfinite(values).all(axis=1).any():
+        if values is None or not (np.isfinite(values).all(axis=1) & values.any(axis=1)).any():
             raise RecordingError(
                 recording.path or recording.name,
                 f"an IMU without {name}",
                 "gyroscope, accelerometer and magnetometer for this model",
                 f"adding {columns} to imu.csv, or the model loose where there is a tracker",
             )
-    return imu
+    finite = np.isfinite(imu.gyroscope).all(axis=1) & np.isfinite(imu.accelerometer).all(axis=1)
+    if finite.all():
+        return imu
+    left = {key: getattr(imu, key)[finite] for key in imu.per_sample}
+    return replace(imu, time_ns=imu.time_ns[finite], **left)
 
 
 def setup(recording: Recording) -> Setup:
     """Up and north as a recording states them, and the field's dip as it is felt in the run.
 
-    Raises `RecordingError` where the stated field is vertical, so that it has no north.
+    Raises `RecordingError` where the stated field is vertical, so that it has no north, or where what is
+    stated is no vector, and what `need_both` raises.
     """
-    gravity = np.asarray(recording.info.get("gravity_ref", GRAVITY_REF), float)
-    stated = np.asarray(recording.info.get("field_ref", FIELD_REF), float)
+    facts = description.facts(recording.info, recording.path or recording.name)
+    gravity = np.array(facts.get("gravity_ref", GRAVITY_REF))
+    stated = np.array(facts.get("field_ref", FIELD_REF))
     up = -gravity / np.linalg.norm(gravity)
     level = stated - up * (up @ stated)
     if np.linalg.norm(level) < 1e-6 * np.linalg.norm(stated):
@@ -69,7 +81,7 @@ def setup(recording: Recording) -> Setup:
             recording.path or recording.name,
             f"field_ref = {stated.tolist()}, along gravity_ref",
             "a field with a horizontal part, which points to magnetic north",
-            "correcting field_ref or gravity_ref in recording.toml",
+            "stating another field_ref or gravity_ref in recording.toml",
             column="field_ref",
         )
     dip = float(np.nanmedian(inclination.field(need_both(recording)).dip))
@@ -77,9 +89,11 @@ def setup(recording: Recording) -> Setup:
 
 
 def thinned(imu: Imu, good: Flags) -> Indices:
-    """Rows of an IMU that are good (N,), so many that `MOST_HZ` is kept, spread evenly."""
+    """Rows of an IMU that are good (N,), every n-th so that about `MOST_HZ` are left in a second."""
     rows = np.flatnonzero(good)
-    if len(rows) < 2:
+    steps = np.diff(imu.time_ns[rows])
+    # The mean, for stamps may come in bunches.
+    steps = steps[steps < _PAUSE_NS]
+    if not steps.size:
         return rows
-    step = float(np.median(np.diff(imu.time_ns[rows])))
-    return rows[:: max(1, round(1e9 / (step * MOST_HZ)))]
+    return rows[:: max(1, round(NANOSECONDS / (float(steps.mean()) * MOST_HZ)))]

@@ -1,9 +1,11 @@
 """Which way is up in the body, when it rests, and how the magnetic field lies to it, before any filter.
 
-From the samples up to an instant alone, but for what rest looks like, which the whole run tells. What is
-found here says how far a magnetometer is to be trusted; no estimate takes an attitude from it.
+From the samples up to an instant, but for what rest looks like and what the gyroscope reads then, which the
+whole run tells. What is found here says how far a magnetometer is to be trusted; no estimate takes an
+attitude from it.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,10 +46,13 @@ def turned(imu: Imu) -> Floats:
 def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     """Unit vectors (N, 3): the specific force, low-passed in a frame that does not turn, in the body.
 
-    The low-pass is of second order (Butterworth) and takes `settling_s` seconds.
+    The low-pass is of second order (Butterworth) and takes `settling_s` seconds. What the gyroscope reads
+    at rest is taken off, where the run rests: what is led on by a bias lags behind by degrees.
     """
     assert imu.accelerometer is not None
-    q = turned(imu)
+    resting = still(imu)
+    bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)
+    q = turned(replace(imu, gyroscope=imu.gyroscope - bias))
     force = _rotate(q, imu.accelerometer)
     if len(force) == 1:
         return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)

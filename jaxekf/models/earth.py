@@ -9,9 +9,11 @@ the field dips below the horizontal, and how strong it is, is found from each re
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jax import Array
 
-from jaxekf import description, inclination
+from jaxekf import description, inclination, vectors
 from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Flags, Floats, Imu, Recording
 from jaxekf.rows import Indices
@@ -97,3 +99,21 @@ def thinned(imu: Imu, good: Flags) -> Indices:
     if not steps.size:
         return rows
     return rows[:: max(1, round(NANOSECONDS / (float(steps.mean()) * MOST_HZ)))]
+
+
+def attitudes(
+    force: Floats, field: Floats, about: Setup, least_sine: float = 1e-6
+) -> vectors.Attitude:
+    """Attitudes (N, 4) of specific forces and fields (N, 3), and where they tell one: where the sine of the
+    angle between the two is not below `least_sine`."""
+    return _attitudes(force, field, -about.gravity_ref, about.field_ref, least_sine)
+
+
+@jax.jit
+def _attitudes(
+    force: Array, field: Array, up: Array, field_ref: Array, least_sine: Array
+) -> vectors.Attitude:
+    def one(a: Array, b: Array) -> vectors.Attitude:
+        return vectors.triad(a, b, up, field_ref, least_sine=least_sine)
+
+    return jax.vmap(one)(force, field)

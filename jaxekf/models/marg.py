@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import inclination, linalg, rotation, vectors
+from jaxekf import inclination, linalg, rotation
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Input, Model, Output, Parameters, Sensor, Start
@@ -30,6 +30,8 @@ from jaxekf.recording import NANOSECONDS, Recording, Samples
 
 START_S = 0.1
 """Seconds whose mean gives the attitude to start from."""
+LEAST_SINE = 0.05
+"""Of the angle between force and field there: a field that is nearly vertical tells no heading."""
 
 
 class State(NamedTuple):
@@ -196,21 +198,19 @@ def rest(recording: Recording) -> Samples:
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first magnetometer sample that gives an attitude with the specific force about it."""
+    """The first magnetometer sample that gives an attitude with the mean specific force after it."""
     imu, about = earth.need_both(recording), earth.setup(recording)
-    assert imu.accelerometer is not None and imu.magnetometer is not None
-    for time_ns in samples["magnetometer"].time_ns:
-        near = (imu.time_ns >= time_ns) & (imu.time_ns <= time_ns + int(START_S * NANOSECONDS))
-        force, field = imu.accelerometer[near].mean(axis=0), imu.magnetometer[near]
-        found = vectors.triad(
-            jnp.asarray(force),
-            jnp.asarray(np.nanmean(field, axis=0)),
-            jnp.asarray(-about.gravity_ref),
-            jnp.asarray(about.field_ref),
-        )
-        if bool(found.valid):
-            return Start(int(time_ns), {"q_ref_body": np.asarray(found.q_ref_body)})
-    return None
+    assert imu.accelerometer is not None
+    seen = samples["magnetometer"]
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accelerometer, axis=0)])
+    begin = np.searchsorted(imu.time_ns, seen.time_ns)
+    end = np.searchsorted(imu.time_ns, seen.time_ns + int(START_S * NANOSECONDS))
+    found = earth.attitudes(total[end] - total[begin], seen.value, about, LEAST_SINE)
+    good = np.flatnonzero(np.asarray(found.valid))
+    if not good.size:
+        return None
+    q = np.asarray(found.q_ref_body)[good[0]]
+    return Start(int(seen.time_ns[good[0]]), {"q_ref_body": q})
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:

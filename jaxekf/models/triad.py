@@ -13,12 +13,11 @@ components is taken. All is by derivation from ``q exp((rate - bias) dt)``.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, rotation, vectors
+from jaxekf import inclination, linalg, rotation, vectors
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Input, Model, Output, Parameters, Sensor
@@ -106,17 +105,12 @@ def attitude(recording: Recording) -> Samples:
     """Attitudes (N, 4) of each pair of readings; parallel vectors and what was not read are masked."""
     imu, about = earth.need_both(recording), earth.setup(recording)
     assert imu.accelerometer is not None and imu.magnetometer is not None
-    norm = np.nanmedian(np.linalg.norm(imu.magnetometer, axis=1))
+    norm = np.nanmedian(inclination.field(imu).norm)
     force, field = imu.accelerometer, imu.magnetometer / norm
-    found = _attitudes(force, field, -about.gravity_ref, about.field_ref)
+    found = earth.attitudes(force, field, about)
     valid = np.asarray(found.valid) & np.isfinite(field).all(axis=1)
     readings = Readings(force, np.where(valid[:, None], field, 1.0))
     return Samples(imu.time_ns, np.asarray(found.q_ref_body), valid, readings, origin=("imu",))
-
-
-@jax.jit
-def _attitudes(force: Array, field: Array, up: Array, field_ref: Array) -> vectors.Attitude:
-    return jax.vmap(vectors.triad, in_axes=(0, 0, None, None))(force, field, up, field_ref)
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:

@@ -15,8 +15,9 @@ from jax import Array, lax
 
 from jaxekf import jit, manifold, run_filter_batch
 from jaxekf.ekf import inputs_of
+from jaxekf.interpolation import InputSample
 from jaxekf.model import Belief, Model, Parameters
-from jaxekf.models import loose, tight
+from jaxekf.models import loose, marg, tight, triad
 from jaxekf.timeline import Knots, Rows, Steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -86,32 +87,29 @@ def _steps(model: Model, runs: int) -> Steps:
     time = np.broadcast_to(_DT * np.arange(_STEPS)[:, None], (runs, _STEPS, 1))
     dt = np.full((runs, _STEPS, 1), _DT)
     dt[:, 0] = 0.0
-    channels = 3 if model.name == "loose" else 6
+    channels = 3 if model.name in ("loose", "triad") else 6
     values = 0.1 * rng.normal(size=(runs, _STEPS, channels))
     if channels == 6:
-        values[..., 2] += 9.81
+        # The toy's accelerometer stands before its gyroscope.
+        values[..., 2 if model is toy_models.MARKERS else 5] += 9.81
     integral = np.concatenate(
         [np.zeros((runs, 1, channels)), np.cumsum(_DT * (values[:, 1:] + values[:, :-1]) / 2, 1)], 1
     )
+    shape = (runs, _STEPS, 1)
+    x, u = model.initial_mean({}), InputSample(values[0, 0], values[0, 0], 1.0)
     fast = {}
-    for index, sensor in enumerate(model.sensors):
-        shape = (runs, _STEPS, 1)
-        if model.name == "loose":
-            value = np.zeros((*shape, 4))
-            value[..., 0], aux = 1.0, None
-        else:
-            value = _arms(model)[index] + 1e-4 * rng.normal(size=(*shape, 3))
-            aux = np.zeros(shape) if model.name == "tight" else np.ones(shape)
+    for sensor in model.sensors:
+        like = 1.0 if model is toy_models.MARKERS else sensor.aux_like
+        params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
+        said = sensor.predict(x, u, params, like)
+        noise = jnp.asarray(1e-4 * rng.normal(size=(*shape, sensor.rows)))
+        put = jax.vmap(partial(manifold.retract, sensor.space, said))
+        value = np.asarray(put(noise.reshape(-1, sensor.rows))).reshape(*shape, -1)
+        aux = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *np.shape(a))), like)
         mask = np.ones((*shape, sensor.rows), bool)
         fast[sensor.name] = Rows(value, aux, mask, np.full(shape, _DT))
     knots = Knots(time[..., 0], values, integral)
     return Steps(time, dt, np.ones((runs, _STEPS, 1), bool), knots, fast, {})
-
-
-def _arms(model: Model) -> np.ndarray:
-    """Where the markers of a model are in the body, (M, 3) metres."""
-    holder = model.parameters.setup if model.name == "tight" else model.parameters.calibration
-    return np.asarray(holder.p_body_marker)
 
 
 def _ungated(model: Model) -> Model:
@@ -124,6 +122,8 @@ def race(seconds: float) -> dict[str, dict[str, float]]:
     for name, model in (
         ("loose", loose.MODEL),
         ("tight, three markers", _ungated(tight.MODEL)),
+        ("triad", triad.MODEL),
+        ("marg, 12 d.o.f., 9 rows", marg.MODEL),
         ("toy of markers, 15 d.o.f.", _ungated(toy_models.MARKERS)),
     ):
         params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)

@@ -52,7 +52,7 @@ FREE = (
     "calibration.accelerometer_bias",
     "calibration.declination",
 )
-ITERATIONS = 12
+ITERATIONS = 15
 CONSOLE = Console(stderr=True)
 COARSE = 6
 """Samples of a training trial that are averaged: a sixth of the work, and the tuned densities do not depend

@@ -18,7 +18,8 @@ def test_tuned_orientation(data_dir):
     has 1.42 deg on these trials, its offline form 1.18."""
     if not (data_dir / "broad").is_dir():
         pytest.skip("no BROAD trials beside the project")
-    trials = [*"--train 01 05 10 16 28 32 --test 02 07 12 24 35".split(), "--alone"]
+    train, test = ["01", "05", "10", "16", "28", "32"], ["02", "07", "12", "24", "35"]
+    trials = ["--train", *train, "--test", *test, "--alone"]
     command = [sys.executable, str(EXAMPLE), str(data_dir / "broad"), *trials]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     found = json.loads(done.stdout.splitlines()[-1])

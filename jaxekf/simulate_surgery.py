@@ -250,8 +250,8 @@ def rate_walk(array: AccelerometerArray, grade: SurgeryGrade) -> Floats:
     and M their linear part: per second T times that with ``Xi`` of a sample, or, as it stands here,
     ``inv(M) Xi inv(M)'`` with ``Xi`` of a density.
     """
-    linear = np.asarray(placement.differences(array, grade.acceleration_density).linear)
-    return np.linalg.cholesky(np.linalg.inv(linear.T @ linear))
+    linear = np.asarray(placement.differences(array, grade.acceleration_density).linear, float)
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(linear.T @ linear)), np.float64)
 
 
 def array_recording(

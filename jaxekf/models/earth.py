@@ -60,6 +60,7 @@ def need_both(recording: Recording) -> Imu:
                 "gyroscope, accelerometer and magnetometer for this model",
                 f"adding {columns} to imu.csv, or the model loose where there is a tracker",
             )
+    assert imu.accelerometer is not None
     finite = np.isfinite(imu.gyroscope).all(axis=1) & np.isfinite(imu.accelerometer).all(axis=1)
     if finite.all():
         return imu

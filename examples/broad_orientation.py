@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 # The tuned filter is compiled in a third of the time so, and what runs then takes seconds.
 os.environ.setdefault("JAXEKF_COMPILE", "quick")
 
-import jax  # noqa: E402
+import jax
 
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jax.config.update("jax_enable_x64", True)
@@ -91,15 +91,15 @@ def coarse(trial: jaxekf.Recording) -> jaxekf.Recording:
 
 
 def start_for(trials: Sequence[jaxekf.Recording]) -> jaxekf.Parameters:
-    """The model's defaults, with the clock at which the training trials' motion capture and gyroscope agree."""
+    """The defaults, with the clock at which the trials' motion capture and gyroscope agree."""
     lags = [synchronise.match(t.need_optical(), t.need_imu(), t.name).latency_s for t in trials]
     calibration = marg.DEFAULTS.calibration._replace(clock_offset=np.array(-np.median(lags)))
     return marg.DEFAULTS._replace(calibration=calibration)
 
 
 def tuned_on(trials: Sequence[jaxekf.Recording], iterations: int) -> tuning.Tuned:
-    """The model's noise tuned on two thirds of the trials, and kept as it was where the others had the least
-    error: further steps fit what is peculiar to a few trials."""
+    """The noise tuned on two thirds of the trials, and kept as it was where the others had the least error:
+    further steps fit what is peculiar to a few trials."""
     judging = trials[2::3]
     learning = [trial for trial in trials if trial not in judging] or trials
 

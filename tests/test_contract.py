@@ -278,7 +278,9 @@ def test_partly_masked_run(model):
     assert np.all(trace[seen] < before[seen])
 
 
-@pytest.mark.parametrize("name", scenario.long_form(list(MODELS), {"loose_pose", "markers"}))
+@pytest.mark.parametrize(
+    "name", scenario.long_form(list(MODELS), {"loose_pose", "markers", "marg"})
+)
 def test_gradients(name):
     """A NaN under differentiation, with data, without and at rest; a parameter that is cut off."""
     model = MODELS[name]

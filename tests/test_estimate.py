@@ -85,7 +85,7 @@ def test_buckets_waste_little(count):
 
 
 @pytest.mark.parametrize(
-    "name", scenario.long_form(list(REGISTRY), {"loose_pose", "loose_additive"})
+    "name", scenario.long_form(list(REGISTRY), {"loose_pose", "loose_additive", "marg"})
 )
 def test_account_is_exact(name):
     """Would catch rows that vanish: read = used + masked + gated + dropped."""

@@ -124,7 +124,8 @@ def left_series(v, terms=40):
 def test_both_branches_agree_with_independent_forms(size):
     """A coefficient of a series, or a threshold at which it is no longer exact."""
     v = size * np.array([0.6, -0.48, 0.64])
-    np.testing.assert_allclose(exp(v), sinc_form(v), rtol=0, atol=2e-16)
+    # NumPy's and XLA's sines are right to the last bit or one beside it, by the processor.
+    np.testing.assert_allclose(exp(v), sinc_form(v), rtol=0, atol=4.5e-16)
     np.testing.assert_allclose(log(sinc_form(v)), v, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(right_jacobian(v), left_series(v), rtol=0, atol=1e-14)
 

@@ -142,7 +142,7 @@ def block_diagonal(blocks: list[Array]) -> Array:
 
 
 def initial_covariance(params: Parameters) -> Array:
-    """Covariance (15, 15)."""
+    """Covariance of a belief of independent parts of three numbers each, such as (15, 15)."""
     return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
 
 

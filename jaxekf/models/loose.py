@@ -85,8 +85,13 @@ def process_noise(params: Parameters, dt: Array) -> Array:
     Exact for the double integrator, so that cutting a step in two changes nothing: the bias walks
     while it is being integrated.
     """
-    white = linalg.covariance(params.noise.gyroscope, 3) * dt
-    walk = linalg.covariance(params.noise.bias_walk, 3)
+    return angle_and_bias_noise(params.noise.gyroscope, params.noise.bias_walk, dt)
+
+
+def angle_and_bias_noise(rate: Array, bias_walk: Array, dt: Array) -> Array:
+    """Covariance (6, 6) of `process_noise`, of the densities of the rate and of its bias's derivative."""
+    white = linalg.covariance(rate, 3) * dt
+    walk = linalg.covariance(bias_walk, 3)
     cross = -0.5 * walk * dt**2
     return jnp.block([[white + walk * dt**3 / 3.0, cross], [cross, walk * dt]])
 

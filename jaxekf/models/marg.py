@@ -24,8 +24,7 @@ from jaxekf import inclination, linalg, rotation
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Input, Model, Output, Parameters, Sensor, Start
-from jaxekf.models import earth, sources
-from jaxekf.models.inertial import block_diagonal
+from jaxekf.models import earth, inertial, sources
 from jaxekf.recording import NANOSECONDS, Recording, Samples
 
 START_S = 0.1
@@ -126,7 +125,7 @@ def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (9, 9) of angle, velocity and bias noise over ``dt``."""
     noise = params.noise
     densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk)
-    return dt * block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
@@ -220,11 +219,6 @@ def initial_mean(first: Mapping[str, Any]) -> State:
     return State(q, zero, zero, zero)
 
 
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (12, 12)."""
-    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
-
-
 def rate_noise(u: InputSample, params: Parameters) -> Array:
     """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
     matrix = params.calibration.gyroscope_matrix
@@ -296,7 +290,7 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3, 3, 3, 1, 1, 1),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     find_start=find_start,
     setup=earth.setup,
     input=Input("imu", sources.imu, lambda params: params.calibration.clock_offset),

@@ -21,8 +21,7 @@ from jaxekf import inclination, linalg, rotation, vectors
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Input, Model, Output, Parameters, Sensor
-from jaxekf.models import earth, sources
-from jaxekf.models.inertial import block_diagonal
+from jaxekf.models import earth, inertial, loose, sources
 from jaxekf.recording import Recording, Samples
 
 
@@ -82,10 +81,7 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (6, 6) of the angle and bias noise over ``dt``, exact for the double integrator."""
-    white = linalg.covariance(params.noise.rate, 3) * dt
-    walk = linalg.covariance(params.noise.bias_walk, 3)
-    cross = -0.5 * walk * dt**2
-    return jnp.block([[white + walk * dt**3 / 3.0, cross], [cross, walk * dt]])
+    return loose.angle_and_bias_noise(params.noise.rate, params.noise.bias_walk, dt)
 
 
 def predict_attitude(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
@@ -118,11 +114,6 @@ def initial_mean(first: Mapping[str, Any]) -> State:
     seen = first.get("attitude")
     q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
     return State(q, jnp.zeros(3, q.dtype))
-
-
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (6, 6)."""
-    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
 
 
 DEFAULTS = Parameters(
@@ -162,7 +153,7 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3, 3),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     start_with=("attitude",),
     input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
     outputs=(

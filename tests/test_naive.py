@@ -116,7 +116,7 @@ def test_blocks_hold_arithmetic_only(name):
         return jnp.sum(output.instants.log_likelihood)
 
     names = set(inside_blocks(jax.make_jaxpr(jax.grad(total))(params).jaxpr))
-    assert "scan" in names
+    assert {"mul", "sqrt"} <= names
     assert not {n for n in names if n.startswith(("reduce_", "dot_general", "custom_call", "argm"))}
 
 

@@ -279,7 +279,7 @@ def test_partly_masked_run(model):
 
 
 @pytest.mark.parametrize(
-    "name", scenario.long_form(list(MODELS), {"loose_pose", "markers", "marg"})
+    "name", scenario.long_form(list(MODELS), {"loose_pose", "tight", "markers", "visual", "marg"})
 )
 def test_gradients(name):
     """A NaN under differentiation, with data, without and at rest; a parameter that is cut off."""
@@ -319,8 +319,9 @@ def test_many_runs(name):
     for seed in (0, 1, 2):
         given = data(model, seed)
         scaled = jax.tree.map(lambda a, seed=seed: (1.0 + 0.1 * seed) * a, params)
-        expected = evaluate(model, scaled, given.mean, given.flat)[1]
-        runs.append((scaled, start(model, scaled, given.mean), given.flat, expected))
+        belief = start(model, scaled, given.mean)
+        expected = scenario.run_filter(model, scaled, belief, given.epochs)
+        runs.append((scaled, belief, given.epochs, expected))
     params, beliefs, steps, expected = (
         jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(a) for a in leaves]), *part)
         for part in zip(*runs, strict=True)
@@ -350,11 +351,11 @@ def test_order_of_sensors(name):
     """A sensor that is linearised at a state which another has already moved."""
     model, params = MODELS[name], parameters(MODELS[name])
     given = data(model, 0)
-    expected = evaluate(model, params, given.mean, given.flat)[1]
+    expected = run_epochs(model, given)
     other, names = renamed(model)
-    steps = given.flat._replace(
-        fast={names[k]: rows for k, rows in given.flat.fast.items()},
-        slow={names[k]: rows for k, rows in given.flat.slow.items()},
+    steps = given.epochs._replace(
+        fast={names[k]: rows for k, rows in given.epochs.fast.items()},
+        slow={names[k]: rows for k, rows in given.epochs.slow.items()},
     )
     assert sorted(names.values()) == [names[k] for k in reversed([s.name for s in model.sensors])]
     belief = start(model, params, given.mean)

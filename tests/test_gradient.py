@@ -128,7 +128,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(
-    "name", scenario.long_form(NAMES, {"loose_rate", "loose_additive", "marg"})
+    "name", scenario.long_form(NAMES, {"loose_rate", "loose_additive", "tight", "marg"})
 )
 def test_gradient_matches_central_differences(name, case):
     model = get_model(name)

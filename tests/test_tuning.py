@@ -21,7 +21,7 @@ PLANTED = {"gyroscope": 0.05, "optical": 0.3}
 
 @pytest.fixture(scope="module")
 def planted():
-    """Six training runs and three held out, with known noise."""
+    """Six training runs of 120 s and three held out, with known noise."""
     seconds = 120.0 if scenario.LONG else 60.0
     return [
         simulate.recording(

@@ -62,7 +62,7 @@ INDEPENDENT = 10
 """How many errors that tell something new the training trials hold: heading is wrong for minutes at a time.
 Against so few the defaults count, and noise that suits only these trials is not found."""
 MADGWICK = (0.01, 0.02, 0.05, 0.1, 0.2)
-MAHONY = (0.1, 0.25, 0.5, 1.0, 2.0)
+MAHONY = (0.05, 0.1, 0.25, 0.5, 1.0)
 SHARES = (0.001, 0.03, 0.3)
 """Mahony's gains of the integral, as shares of the proportional ones; the package takes no 0."""
 NORTH_WEST_UP = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])

@@ -17,6 +17,9 @@ from jaxekf.timeline import Rows
 
 _HUBER = 0.95
 """Share of honest samples that Huber's weight leaves alone."""
+_REACH = 7.0
+"""Of the belief that is widened: points are let in whose squared error is so many times larger than that of
+all in the mean, which of honest ones one in a thousand is."""
 _STUDENT = 4.0
 """Degrees of freedom of Student's law: its tails are heavy, its variance is finite."""
 
@@ -173,17 +176,21 @@ def _gates(
         return gated, None, None, None
     if not watched:
         return gated, refused, none, None
-    finite = {}
+    ratios = {}
     tally = _Tally(none, none, jnp.zeros_like(refused), jnp.ones_like(refused))
     for name in watched:
         given = (seen[name].rows.mask, groups[name], samples[name].dt)
-        tally, gated[name], finite[name] = _counted(system.measurements[name].sensor, tally, *given)
+        tally, gated[name], ratios[name] = _counted(system.measurements[name].sensor, tally, *given)
     let_in, kept_out, refused_s, excess = tally
     after = jnp.where(let_in, 0.0, refused + refused_s)
     # Earlier samples must have used up the patience: a single one is refused whatever its period.
     recovered = kept_out & ~let_in & (refused > system.model.patience_s)
     for n in watched:
-        gated[n] &= ~(finite[n] & jnp.broadcast_to(recovered, finite[n].shape))
+        known = ratios[n] < jnp.inf
+        if isinstance(groups[n], _Distance):
+            # Most points of an image are honest and the others far off, also from a belief so widened.
+            known &= ratios[n] <= _REACH * jnp.broadcast_to(excess, known.shape)
+        gated[n] &= ~(known & jnp.broadcast_to(recovered, known.shape))
     widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
     return gated, jnp.where(recovered, 0.0, after), recovered, widened
 
@@ -196,23 +203,17 @@ class _Tally(NamedTuple):
     refused_s: Array
     """The longest sampling period of what was refused."""
     excess: Array
-    """How many times larger than expected the squared error of it is at most."""
+    """How many times larger than expected the squared error of it is at most; of many like groups in the
+    geometric mean, in which a few that are far off count little."""
 
 
 def _counted(
     sensor: Sensor, tally: _Tally, mask: Array, groups: Any, dt: Array
 ) -> tuple[_Tally, Array, Array]:
-    """The tally with one more sensor, its rows that were refused, and those of a finite distance."""
+    """The tally with one more sensor, its rows that were refused, and for each row how many times larger
+    than expected its group's squared error is."""
     if isinstance(groups, _Distance):
-        rows = tuple(range(mask.shape[1]))
-
-        def one(tally: _Tally, at: Any) -> tuple[_Tally, Any]:
-            mask, each = at
-            tally, *found = _counted(_alone(sensor), tally, mask, [_Group(rows, *each)], dt)
-            return tally, tuple(found)
-
-        tally, (gated, finite) = lax.scan(one, tally, (mask, groups))
-        return tally, gated, finite
+        return _counted_many(_alone(sensor), tally, mask, groups, dt)
     let_in, kept_out, refused_s, excess = tally
     gated, ratio = _gate(sensor, mask, groups)
     finite = gated & (jnp.stack(ratio) < jnp.inf)
@@ -221,7 +222,45 @@ def _counted(
         kept_out = kept_out | finite[row]
         excess = jnp.where(finite[row], jnp.maximum(excess, ratio[row]), excess)
         refused_s = jnp.where(finite[row], jnp.maximum(refused_s, dt), refused_s)
-    return _Tally(let_in, kept_out, refused_s, excess), gated, finite
+    return _Tally(let_in, kept_out, refused_s, excess), gated, jnp.stack(ratio)
+
+
+def _counted_many(
+    sensor: Sensor, tally: _Tally, mask: Array, groups: _Distance, dt: Array
+) -> tuple[_Tally, Array, Array]:
+    """The same with a sensor of many like groups, `sensor` being one of them.
+
+    It has let something in where it let in most of what it saw: by chance a few points always fit.
+    """
+    rows = tuple(range(mask.shape[1]))
+    zero = jnp.zeros_like(dt)
+
+    def one(carry: tuple[Array, Array, Array, Array], at: Any) -> tuple[Any, Any]:
+        balance, kept_out, number, logs = carry
+        mask, each = at
+        gated, ratio = _gate(sensor, mask, [_Group(rows, *each)])
+        refused, seen = gated[0], mask[0]
+        for row in rows[1:]:
+            refused, seen = refused | gated[row], seen | mask[row]
+        known = refused & (ratio[0] < jnp.inf)
+        balance = balance + jnp.where(refused, -1.0, jnp.where(seen, 1.0, 0.0))
+        log = jnp.log(jnp.where(known, jnp.maximum(ratio[0], 1.0), 1.0))
+        carry = (balance, kept_out | known, number + known.astype(dt.dtype), logs + log)
+        return carry, (gated, jnp.stack(ratio))
+
+    begin = (zero, jnp.zeros(dt.shape, bool), zero, zero)
+    (balance, refused, number, logs), (gated, ratio) = lax.scan(one, begin, (mask, groups))
+    larger = jnp.maximum(tally.excess, jnp.exp(logs / jnp.maximum(number, 1.0)))
+    return (
+        _Tally(
+            tally.let_in | (balance > 0.0),
+            tally.kept_out | refused,
+            jnp.where(refused, jnp.maximum(tally.refused_s, dt), tally.refused_s),
+            jnp.where(refused, larger, tally.excess),
+        ),
+        gated,
+        lax.stop_gradient(ratio),
+    )
 
 
 def _groups(sensor: Sensor, linear: Linear, prior: Array) -> Any:

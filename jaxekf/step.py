@@ -187,6 +187,8 @@ def take_block(
 
         def one(carry: tuple[Gained, Array], rows: algebra.Rows) -> tuple[Any, None]:
             gained, pivot = take_block(slope, carry[0], rows, adjoint)
+            # Rounding that is not symmetric grows from one group to the next.
+            gained = gained._replace(cov=linalg.symmetrise(gained.cov))
             return (gained, jnp.minimum(carry[1], pivot)), None
 
         return lax.scan(one, (gained, jnp.ones_like(gained.log_likelihood)), rows)[0]

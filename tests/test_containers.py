@@ -279,7 +279,7 @@ WRONG = {
     "complex": (changed(imu__gyroscope=np.zeros((50, 3), complex)), "complex128", "float64"),
     "flags": (changed(optical__valid=FLAGS + 1), "optical/valid[0]", "0 or 1"),
     "large": (changed(imu__gyroscope=np.full((50, 3), 2**60)), "gyroscope[0, 0]", "2^53"),
-    "nothing": ({"photos/first": FLAGS}, "no stream", "optical, markers, imu, encoder"),
+    "nothing": ({"photos/first": FLAGS}, "no stream", "optical, markers, camera, imu, encoder"),
     "twice": (changed(optical__time_ns=np.r_[TIMES[:1], TIMES[:-1]]), "twice with other numbers"),
     "backwards": (changed(imu__time_ns=np.roll(arrays()["imu/time_ns"], 1)), "imu/time[1]"),
     "all lost": (changed(optical__valid=~FLAGS), "no usable row", "20 hidden", "run.", ":optical"),

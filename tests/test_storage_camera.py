@@ -89,6 +89,25 @@ def test_turns_come_back_exactly(tmp_path):
             assert_same(found, known)
 
 
+def test_a_turn_is_not_judged_again_in_one_file(tmp_path):
+    """Would catch a quaternion of few digits that changes in a file that keeps every bit."""
+    known = replace(camera(), q_body_camera=np.array([0.6, 0.0, 0.8000001, 0.0]))
+    for suffix in (".h5", ".npz"):
+        found = jaxekf.load(jaxekf.save(run_of(known), tmp_path / f"run{suffix}"))
+        assert_same(found.need_camera(), known)
+
+
+@pytest.mark.parametrize("suffix", ["", ".h5"])
+def test_one_image_a_second(tmp_path, suffix):
+    """Would catch a slow camera taken for one whose times are in another unit, or such times believed."""
+    slow = replace(camera(), time_ns=BIG + np.arange(6) * 1_000_000_000)
+    found = jaxekf.load(jaxekf.save(run_of(slow), tmp_path / f"slow{suffix}"))
+    assert_same(found.need_camera(), slow)
+    wrong = replace(camera(), time_ns=BIG + np.arange(6) * 33_000_000_000)
+    with pytest.raises(RecordingError, match="a sample every 33 s, expected a rate"):
+        jaxekf.load(jaxekf.save(run_of(wrong), tmp_path / f"wrong{suffix}"))
+
+
 def test_what_was_not_recorded_stays_none(tmp_path):
     """Would catch a column of nothing, a latency that nobody stated, or a lens that is needed."""
     plain = replace(camera(), sigma=None, latency_ns=0)

@@ -175,7 +175,8 @@ def before_rows(p: Pattern, rows: Rows, found: Solved, info: Information) -> Inf
     if many.are_many(rows.mask):
 
         def one(info: Information, at: Any) -> tuple[Information, None]:
-            return before_rows(p, *at, info), None
+            rows, found = at
+            return before_rows(p, rows, found, info), None
 
         return lax.scan(one, info, (rows, found), reverse=True)[0]
     size, back, turned = p.shape[1], p.transposed, patterned.transpose(rows.slope)

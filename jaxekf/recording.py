@@ -47,6 +47,11 @@ class Samples:
     """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
     thinned: int = 0
     """Samples of that stream that are left out here because so many tell nothing more."""
+    points: Times | None = None
+    """(N,) where a sample is made of like groups, such as the points of an image: how many of them the
+    source has; the account counts these. None where a sample is one row of the source."""
+    copies: int = 1
+    """Groups in a sample, those included that only fill it up."""
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,26 @@ def eight(seed: int = 0) -> ToolMotion:
     return ToolMotion(sway, amplitude, frequency, phase)
 
 
+def shaken(seed: int = 0) -> ToolMotion:
+    """A hand that turns and shakes the camera before the wall, by up to 20 deg and some 2 rad/s: what tells
+    where the camera is in the body."""
+    rng = np.random.default_rng([seed, 34])
+    size = (3, 2)
+    sway = Facing(
+        amplitude=np.deg2rad(rng.uniform(5.0, 8.0, size)),
+        frequency=rng.uniform(0.6, 1.4, size),
+        phase=rng.uniform(0.0, 2.0 * np.pi, size),
+    )
+    place = np.array([[1.4], [0.0], [-2.6]])
+    shake = rng.uniform(0.05, 0.15, size)
+    return ToolMotion(
+        sway,
+        np.concatenate([place, shake], axis=1),
+        np.concatenate([np.zeros((3, 1)), rng.uniform(0.3, 0.8, size)], axis=1),
+        np.concatenate([np.full((3, 1), np.pi / 2), rng.uniform(0.0, 6.28, size)], axis=1),
+    )
+
+
 def resting() -> ToolMotion:
     """A body that rests at the middle of the eight and looks at the wall."""
     nothing = np.zeros((3, 1))

@@ -82,8 +82,10 @@ def test_both_forms_agree():
         samples[model.name] = (jnp.linalg.solve(factor, residual(zero)), slope)
     (one, first), (other, second) = samples.values()
     assert np.linalg.norm(one) > 0.1
-    np.testing.assert_allclose(one, other, atol=0.03 * np.linalg.norm(one))
-    np.testing.assert_allclose(first, second, atol=0.03 * np.abs(second).max())
+    assert np.linalg.norm(other) == pytest.approx(np.linalg.norm(one), rel=0.03)
+    # What they say of the state: score and information, whatever the axes of the two rows.
+    for a, b in ((first.T @ one, second.T @ other), (first.T @ first, second.T @ second)):
+        np.testing.assert_allclose(a, b, atol=0.03 * np.abs(b).max())
 
 
 def drawn(count, seconds, keep="everything", **changes):
@@ -210,9 +212,16 @@ def test_gravity_off_by_a_degree():
 def test_the_camera_is_found_where_it_is():
     """Would catch a lever arm or alignment whose gradient has the wrong frame (row 3)."""
     turn, shift = np.deg2rad([1.2, -1.0, 1.25]), np.array([0.012, -0.011, 0.0115])
+    count, seconds, larger = (4, 15.0, 1.0) if scenario.LONG else (2, 6.0, 3.0)
     trained = []
-    for seed in range(2):
-        run = camera_recording(f"run-{seed}", seed=seed, duration_s=8.0, grade=few())
+    for seed in range(count):
+        run = camera_recording(
+            f"run-{seed}",
+            simulate_camera.shaken(seed),
+            seed=seed,
+            duration_s=seconds,
+            grade=few(),
+        )
         camera = run.need_camera()
         wrong = replace(
             camera,
@@ -224,7 +233,8 @@ def test_the_camera_is_found_where_it_is():
         trained.append(run.replace(camera=wrong, encoder=None))
     tuned = tuning.tune(
         trained,
-        model="visual",
+        # A camera that is 2 deg off puts most points beyond the gates.
+        model=jaxekf.robust("visual", "none"),
         objective="map",
         free=["calibration.lever_arm", "calibration.alignment"],
         optimiser="fisher",
@@ -233,8 +243,8 @@ def test_the_camera_is_found_where_it_is():
     )
     calibration = tuned.params.calibration
     off = Rotation.from_rotvec(calibration.alignment) * Rotation.from_rotvec(turn).inv()
-    assert np.rad2deg(off.magnitude()) < 0.1
-    assert np.abs(np.asarray(calibration.lever_arm) - shift).max() < 2e-3
+    assert np.rad2deg(off.magnitude()) < 0.1 * larger
+    assert np.linalg.norm(np.asarray(calibration.lever_arm) - shift) < 2e-3 * larger
     planted = dict(zip("012", shift, strict=True)), dict(zip("012", turn, strict=True))
     held = 0
     for name, true in zip(("lever_arm", "alignment"), planted, strict=True):

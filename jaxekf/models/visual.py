@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -214,9 +215,9 @@ def predict_bilinear(x: State, u: Any, params: Parameters, aux: SeenPoint) -> Ar
 
 def bilinear_noise(params: Parameters, aux: SeenPoint, dt: Array) -> Array:
     """Covariance (2, 2), metres squared: that of the image point at the landmark's depth."""
+    slope = jax.jacfwd(partial(projection.ray, lens_of(params)))(aux.pixel)
     variance = params.noise.pixel**2 + aux.sigma**2
-    each = variance * (aux.depth / lens_of(params).focal) ** 2
-    return each[:, None] * jnp.eye(2)
+    return variance * aux.depth**2 * linalg.multiply_transposed(slope, slope)
 
 
 def _density(name: str, params: Parameters, aux: Any, dt: Array) -> Array:
@@ -244,15 +245,17 @@ def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
     if stream.sigma is not None:
         sigma = np.nan_to_num(np.where(mask, stream.sigma[here, order], 0.0))
     place = stream.p_ref_landmark[order]
-    aux: Any = Point(_filled(place, short), _filled(sigma, short))
-    value = _filled(pixel, short)
+    place, sigma, value = (_filled(a, short) for a in (place, sigma, pixel))
+    aux: Any = Point(place, sigma)
     if bilinear:
-        depth = _filled(_depth(stream, place, recording), short)
-        aux, value = SeenPoint(*aux, value, depth), np.zeros_like(value)
+        aux = SeenPoint(place, sigma, value, _depth(stream, place, recording))
+        value = np.zeros_like(value)
     rows = np.repeat(_filled(mask, short), 2, axis=1)
     taken = stream.time_ns - stream.latency_ns
     flat = value.reshape(len(value), -1)
-    return Samples(taken, flat, rows, aux, stream.latency_ns, ("camera",))
+    there = stream.visible.sum(axis=1)
+    known = (stream.latency_ns, ("camera",))
+    return Samples(taken, flat, rows, aux, *known, points=there, copies=count)
 
 
 def _filled(values: Any, short: int) -> Any:
@@ -426,9 +429,10 @@ OUTPUTS = (
 
 def _point(count: int, bilinear: bool) -> Sensor:
     """One correspondence."""
-    like: Any = Point(np.array([0.0, 0.0, 2.0]), 0.0)
+    place = np.array([0.0, 0.0, 2.0])
+    like: Any = Point(place, 0.0)
     if bilinear:
-        like = SeenPoint(*like, np.array([160.0, 120.0]), 2.0)
+        like = SeenPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
     return Sensor(
         "camera",
         Euclidean(2, "m" if bilinear else "px"),

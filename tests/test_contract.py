@@ -280,9 +280,7 @@ def test_partly_masked_run(model):
 
 @pytest.mark.parametrize(
     "name",
-    scenario.long_form(
-        list(MODELS), {"loose_pose", "tight", "markers", "visual", "visual_bilinear", "marg"}
-    ),
+    scenario.long_form(list(MODELS), {"loose_pose", "tight", "markers", "visual_bilinear", "marg"}),
 )
 def test_gradients(name):
     """A NaN under differentiation, with data, without and at rest; a parameter that is cut off."""

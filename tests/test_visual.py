@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import ekf, linalg, manifold, regions, simulate, timeline
+from jaxekf import ekf, linalg, manifold, regions, simulate, simulate_camera, timeline
 from jaxekf.model import Belief
 from jaxekf.models import visual
 from jaxekf.parameters import as_arrays
@@ -21,7 +21,8 @@ from jaxekf.recording import from_scipy, to_scipy
 from jaxekf.simulate_camera import CameraGrade, camera_recording
 from jaxekf.truth import encoder_at
 
-POINTS = 8
+POINTS, SECONDS = 8, 5.0
+"""The same for all runs that are estimated: one compilation."""
 
 
 def few(**changes):
@@ -46,7 +47,7 @@ def errors(made, recording, from_s=1.0):
 )
 def test_the_eight_is_followed(name):
     """Would catch a lever arm, a latency or a gravity of the wrong sign, and gates that lock themselves."""
-    recording = camera_recording("run", seed=2, duration_s=6.0, grade=few())
+    recording = camera_recording("run", seed=2, duration_s=SECONDS, grade=few())
     late = replace(
         recording.camera, time_ns=recording.camera.time_ns + 30_000_000, latency_ns=30_000_000
     )
@@ -99,8 +100,12 @@ def drawn(count, seconds, keep="everything", **changes):
     recording = camera_recording("run", seed=5, duration_s=seconds, grade=few())
     line = timeline.build(model, recording)
     params = as_arrays(model.parameters)._replace(setup=line.setup)
+    # A motion that wanders little, so that the landmarks stay ahead of the camera.
     params = params._replace(
-        noise=params.noise._replace(jerk=jnp.asarray(0.3), angular_acceleration=jnp.asarray(0.1))
+        noise=params.noise._replace(jerk=jnp.asarray(0.3), angular_acceleration=jnp.asarray(0.1)),
+        initial=params.initial._replace(
+            velocity=jnp.asarray(0.1), acceleration=jnp.asarray(0.2), rate=jnp.asarray(0.05)
+        ),
     )
     mean = as_arrays(model.initial_mean(line.first))
     cov = model.initial_covariance(params)
@@ -178,7 +183,7 @@ def test_mismatches_are_gated():
         grade = few(mismatched=share)
         made = []
         for seed in range(6):
-            run = camera_recording(f"run-{seed}", seed=seed, duration_s=5.0, grade=grade)
+            run = camera_recording(f"run-{seed}", seed=seed, duration_s=SECONDS, grade=grade)
             made.append((run, jaxekf.estimate(run, "visual")))
         found[share] = np.sqrt(np.mean([np.square(errors(e, r)) for r, e in made], axis=0))
         record = made[0][1].sensors["camera"]
@@ -190,7 +195,7 @@ def test_mismatches_are_gated():
 def test_gravity_off_by_a_degree():
     """Would catch gravity that is subtracted in the wrong frame: without vision 1 deg is 0.17 m/s^2, and
     8.5 cm after a second, as the source says (row 5)."""
-    run = camera_recording("run", seed=4, duration_s=1.4, grade=few(), blind=((0.1, 9.0),))
+    run = camera_recording("run", seed=4, duration_s=SECONDS, grade=few(), blind=((0.1, 9.0),))
     up = np.asarray(run.info["gravity_ref"])
     off = Rotation.from_rotvec(np.deg2rad([0.0, 1.0, 0.0])).apply(up)
     params = visual.DEFAULTS._replace(
@@ -209,17 +214,18 @@ def test_gravity_off_by_a_degree():
     assert np.linalg.norm(drift) == pytest.approx(0.085, abs=0.01)
 
 
+@pytest.mark.long
+@pytest.mark.skipif(not scenario.LONG, reason="long form: set JAXEKF_LONG=1")
 def test_the_camera_is_found_where_it_is():
     """Would catch a lever arm or alignment whose gradient has the wrong frame (row 3)."""
     turn, shift = np.deg2rad([1.2, -1.0, 1.25]), np.array([0.012, -0.011, 0.0115])
-    count, seconds, larger = (4, 15.0, 1.0) if scenario.LONG else (2, 6.0, 3.0)
     trained = []
-    for seed in range(count):
+    for seed in range(4):
         run = camera_recording(
             f"run-{seed}",
             simulate_camera.shaken(seed),
             seed=seed,
-            duration_s=seconds,
+            duration_s=15.0,
             grade=few(),
         )
         camera = run.need_camera()
@@ -243,8 +249,8 @@ def test_the_camera_is_found_where_it_is():
     )
     calibration = tuned.params.calibration
     off = Rotation.from_rotvec(calibration.alignment) * Rotation.from_rotvec(turn).inv()
-    assert np.rad2deg(off.magnitude()) < 0.1 * larger
-    assert np.linalg.norm(np.asarray(calibration.lever_arm) - shift) < 2e-3 * larger
+    assert np.rad2deg(off.magnitude()) < 0.1
+    assert np.linalg.norm(np.asarray(calibration.lever_arm) - shift) < 2e-3
     planted = dict(zip("012", shift, strict=True)), dict(zip("012", turn, strict=True))
     held = 0
     for name, true in zip(("lever_arm", "alignment"), planted, strict=True):

@@ -21,14 +21,13 @@ PLANTED = {"gyroscope": 0.05, "optical": 0.3}
 
 @pytest.fixture(scope="module")
 def planted():
-    """Six training runs and three held out, with known noise."""
-    seconds = 120.0 if scenario.LONG else 60.0
+    """Six training runs of 120 s and three held out, with known noise."""
     return [
         simulate.recording(
             f"run-{i}",
             simulate.free_motion(i),
             seed=i,
-            duration_s=seconds,
+            duration_s=120.0,
             occlusions=[(40.0, 41.0)],
         )
         for i in range(9)
@@ -74,7 +73,7 @@ def full(short):
 )
 def test_planted_noise_is_found(planted, objective, factor):
     """Would catch a wrong gradient, a density that depends on the rate, or a tuner that gives up."""
-    tuned = tuning.tune(planted[:6], start=start_at(factor), objective=objective, iterations=30)
+    tuned = tuning.tune(planted[:6], start=start_at(factor), objective=objective, iterations=40)
     if objective.likelihood:
         for name, value in PLANTED.items():
             assert np.rad2deg(getattr(tuned.params.noise, name)) == pytest.approx(value, rel=0.1)

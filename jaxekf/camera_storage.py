@@ -71,7 +71,7 @@ def read(table: Table, source: description.Source, landmarks: Table) -> tuple[Ca
     stream = Camera(
         made.time_ns,
         pixel,
-        np.isfinite(pixel).all(axis=2),
+        np.asarray(np.isfinite(pixel).all(axis=2)),
         names,
         p_ref_landmark,
         sigma=None if sigma is None else made.spread(sigma),

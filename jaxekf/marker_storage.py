@@ -50,7 +50,7 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     stream = Markers(
         made.time_ns,
         position,
-        np.isfinite(position).all(axis=2),
+        np.asarray(np.isfinite(position).all(axis=2)),
         names,
         p_body_marker,
         quality=None if quality is None else made.spread(quality),

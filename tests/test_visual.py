@@ -111,22 +111,28 @@ def drawn(count, seconds, keep="everything", **changes):
     cov = model.initial_covariance(params)
     steps = jax.tree.map(jnp.asarray, line.steps)
 
-    def one(key):
+    def draw(key):
         first, rest = jax.random.split(key)
         start = manifold.retract(
             model.space, mean, jnp.linalg.cholesky(cov) @ jax.random.normal(first, (21,))
         )
-        truth, seen = simulate.draw(model, params, start, steps, rest)
+        return simulate.draw(model, params, start, steps, rest)
+
+    def follow(truth, seen):
         output = ekf.run_filter(model, params, Belief(mean, cov), seen)
         at = output.instants
         error = jax.vmap(jax.vmap(partial(manifold.local, model.space)))(at.updated.mean, truth)
-        white = jnp.linalg.solve(at.updated.cov, error[..., None])[..., 0]
         nis = {name: i.nis for name, i in output.innovations.items()}
         ahead = jax.tree.map(lambda a: a[:, -1], at.predicted)
-        return jnp.sum(error * white, axis=-1), nis, ahead, seen.slow["camera"]
+        return error, at.updated.cov, nis, ahead
 
     keys = jax.random.split(jax.random.key(7), count)
-    return model, params, steps, scenario.quick_jit(jax.vmap(one))(keys)
+    truth, seen = scenario.quick_jit(jax.vmap(draw))(keys)
+    error, cov, nis, ahead = scenario.quick_jit(jax.vmap(follow))(truth, seen)
+    error = np.asarray(error)
+    white = np.linalg.solve(np.asarray(cov), error[..., None])[..., 0]
+    nees = np.sum(error * white, axis=-1)
+    return model, params, steps, (nees, nis, ahead, seen.slow["camera"])
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,9 @@ def test_groups_are_the_rows_of_one_sample(changes):
             told = (output.instants.updated, output.instants.log_likelihood)
             return sum(jnp.sum(jnp.sin(a + 0.3)) for a in jax.tree.leaves(told)), output
 
-        return scenario.quick_jit(jax.value_and_grad(total, has_aux=True))(model.parameters)
+        # Derivatives take the compiler minutes; `test_naive` and `test_contract` have them of `visual`.
+        made = jax.value_and_grad(total, has_aux=True) if scenario.LONG else lambda p: (total(p),)
+        return scenario.quick_jit(made)(model.parameters)
 
     one, other = (found(with_camera(point, whole=whole)) for whole in (False, True))
     assert_same(one, other)

@@ -369,16 +369,17 @@ def test_order_of_sensors(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "sensor", "group"), [("visual", "camera", (2, 3)), ("markers", "marker_1", (0, 1, 2))]
+    ("name", "sensor", "group", "error"),
+    [("visual", "camera", (2, 3), 500.0), ("markers", "marker_1", (0, 1, 2), 5.0)],
 )
-def test_gate_rejects_one_group(name, sensor, group):
+def test_gate_rejects_one_group(name, sensor, group, error):
     """A gate that lets a gross error in, throws good groups out too, or leaves a trace of it."""
     model, rows = MODELS[name], list(group)
     given = data(model, 4)
     samples = given.epochs.slow[sensor]
     epoch = int(np.flatnonzero(samples.mask[1:, rows].all(axis=-1))[0]) + 1
     value, mask = samples.value.copy(), samples.mask.copy()
-    value[epoch, rows] += 5.0
+    value[epoch, rows] += error
     mask[epoch, rows] = False
 
     def with_rows(changed):

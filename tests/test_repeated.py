@@ -66,7 +66,7 @@ def test_groups_are_the_rows_of_one_sample(changes):
             told = (output.instants.updated, output.instants.log_likelihood)
             return sum(jnp.sum(jnp.sin(a + 0.3)) for a in jax.tree.leaves(told)), output
 
-        # Derivatives take the compiler minutes; `test_naive` and `test_contract` have them of `visual`.
+        # Derivatives take the compiler minutes.
         made = jax.value_and_grad(total, has_aux=True) if scenario.LONG else lambda p: (total(p),)
         return scenario.quick_jit(made)(model.parameters)
 

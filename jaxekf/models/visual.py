@@ -25,11 +25,21 @@ from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Model, Output, Parameters, Sensor, Start, repeated
 from jaxekf.models import inertial, sources
 from jaxekf.projection import Lens
-from jaxekf.recording import NANOSECONDS, Camera, Recording, Samples, to_scipy
+from jaxekf.recording import (
+    NANOSECONDS,
+    Camera,
+    Flags,
+    Floats,
+    Recording,
+    Samples,
+    Times,
+    to_scipy,
+)
 
 GATE = 0.999
 _FEWEST = 8
 """Groups of an image that a model has at least; it has a multiple of them, so that few are compiled."""
+_LINE_S = 0.35
 _NEAR_S = 0.1
 """An IMU sample so near to the first image tells acceleration and rate there."""
 
@@ -317,7 +327,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     known: dict[str, Any] = {
         "position": raw.position[first],
         "q_ref_body": raw.q_ref_body[first],
-        "velocity": pose.velocity_at(taken, raw.position, valid, first),
+        "velocity": _velocity(taken, raw.position, valid, first),
     }
     near = int(np.argmin(np.abs(imu.time_ns - taken[first])))
     if abs(int(imu.time_ns[near] - taken[first])) <= _NEAR_S * NANOSECONDS:
@@ -330,6 +340,16 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     if waited > 0.0:
         note = f"waited {waited:.3f} s for an image from which a pose follows, to start from"
     return Start(int(taken[first]), known, note)
+
+
+def _velocity(taken: Times, position: Floats, valid: Flags, first: int) -> Floats:
+    """Velocity (3,), m/s, at an image: slope of a line through the positions of the third of a second from
+    there, since those of single images are too uncertain for a difference; 0 where there is one only."""
+    t = (taken - taken[first]) / NANOSECONDS
+    near = valid & (t >= 0.0) & (t <= _LINE_S)
+    if near.sum() < 2:
+        return np.zeros(3)
+    return np.polynomial.polynomial.polyfit(t[near], position[near], 1)[1]
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
@@ -377,8 +397,8 @@ DEFAULTS = Parameters(
         latency=np.array(0.0),
     ),
     Initial(
-        position=0.03,
-        velocity=0.5,
+        position=0.05,
+        velocity=1.0,
         acceleration=1.0,
         attitude=np.deg2rad(1.0),
         rate=0.2,

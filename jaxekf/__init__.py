@@ -31,7 +31,7 @@ from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.parameters import load as load_parameters
 from jaxekf.parameters import save as save_parameters
-from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, Samples
+from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
 from jaxekf.requested import Every, every
 from jaxekf.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.robust import robust
@@ -46,6 +46,7 @@ __all__ = [
     "SO3",
     "AdditiveQuaternion",
     "Belief",
+    "Camera",
     "Consistency",
     "Diagnosis",
     "Encoder",

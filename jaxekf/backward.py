@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf import algebra, epochs, linalg, patterned
+from jaxekf import algebra, epochs, linalg, many, patterned
 from jaxekf.algebra import Gained, Rows, Solved
 from jaxekf.kernels import loop
 from jaxekf.lanes import written_sum
 from jaxekf.model import Belief
 from jaxekf.patterned import Pattern
 from jaxekf.recursion import First, Given
-from jaxekf.step import Moment, Track, any_of, begin, blocks_of_rows, look
+from jaxekf.step import Moment, Track, any_used, begin, blocks_of_rows, look, take_keeping
 from jaxekf.system import System
 
 
@@ -151,10 +151,10 @@ def _before_update(
     gained = Gained(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
     taken = []
     for slope, rows in blocks_of_rows(system.measurements, linear):
-        gained, _, solved = algebra.take(slope, gained, rows, with_inverse=True)
+        gained, solved = take_keeping(slope, gained, rows)
         taken.append((slope, rows, solved))
     correction = system.correction
-    used = any_of([one.rows.mask for one in linear.values()])
+    used = any_used(linear)
     _, reset, shift = correction.piece(
         prepared["correction"], prior.mean, gained.delta, used, adjoint=adjoint
     )
@@ -170,7 +170,15 @@ def _before_update(
 
 
 def before_rows(p: Pattern, rows: Rows, found: Solved, info: Information) -> Information:
-    """``A' a + H' inv(S) e`` and ``A' L A + H' inv(S) H`` with ``A = I - K H``."""
+    """``A' a + H' inv(S) e`` and ``A' L A + H' inv(S) H`` with ``A = I - K H``, of rows that
+    `step.take_keeping` took."""
+    if many.are_many(rows.mask):
+
+        def one(info: Information, at: Any) -> tuple[Information, None]:
+            rows, found = at
+            return before_rows(p, rows, found, info), None
+
+        return lax.scan(one, info, (rows, found), reverse=True)[0]
     size, back, turned = p.shape[1], p.transposed, patterned.transpose(rows.slope)
     gain = [row[:size] for row in found.solved]
     seen = [row[size] for row in found.solved]

@@ -23,7 +23,7 @@ class Field(NamedTuple):
 
     kind: str
     shape: tuple[str | int, ...] = ()
-    """N samples, M markers."""
+    """N samples, M markers, L landmarks."""
     unit: str = ""
     frame: str = ""
     needed: bool = False
@@ -60,6 +60,20 @@ LAYOUT: Mapping[str, Mapping[str, Field]] = {
         "quality": Field(NUMBER, ("N", "M")),
         "quality_min": Field(NUMBER),
         "error": Field(NUMBER, ("N", "M"), "m"),
+        "latency_ns": _LATENCY,
+    },
+    "camera": {
+        "time_ns": _TIMES,
+        "names": Field(TEXT, ("L",), needed=True),
+        "pixel": Field(NUMBER, ("N", "L", 2), "px", "image, u to the right, v down", needed=True),
+        "visible": Field(FLAG, ("N", "L"), "1"),
+        "p_ref_landmark": Field(NUMBER, ("L", 3), "m", "reference", needed=True),
+        "focal": Field(NUMBER, (2,), "px", needed=True),
+        "centre": Field(NUMBER, (2,), "px", needed=True),
+        "radial": Field(NUMBER, (2,), "1"),
+        "p_body_camera": Field(NUMBER, (3,), "m", "body"),
+        "q_body_camera": Field(NUMBER, (4,), "1", "w,x,y,z, camera to body"),
+        "sigma": Field(NUMBER, ("N", "L"), "px"),
         "latency_ns": _LATENCY,
     },
     "imu": {
@@ -131,7 +145,7 @@ def check_type(place: str, key: str, dtype: np.dtype, field: Field) -> None:
 def check_shape(
     place: str, key: str, shape: tuple[int, ...], field: Field, sizes: dict[str, int]
 ) -> None:
-    """The shape is the documented one; `sizes` of N and M are filled in by the first that has them."""
+    """The shape is the documented one; `sizes` of N, M and L are filled in by the first that has them."""
     fits = len(shape) == len(field.shape) or (field.shape == () and shape == (1,))
     for wanted, size in zip(field.shape, shape, strict=False):
         fits &= size == (sizes.setdefault(wanted, size) if isinstance(wanted, str) else wanted)

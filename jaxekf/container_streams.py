@@ -1,14 +1,15 @@
 """Arrays of a file as streams of a recording, their rows judged as those of any source are."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from jaxekf import description, intake
-from jaxekf.recording import Encoder, Imu, Markers, Optical
-from jaxekf.rows import Intake, Part, Place
+from jaxekf import camera_storage, description, intake
+from jaxekf.frame_lines import NAMES, bad_name
+from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Times
+from jaxekf.rows import Indices, Intake, Part, Place
 
 
 def optical(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Optical, Intake]:
@@ -47,26 +48,17 @@ def encoder(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Encoder
 
 def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers, Intake]:
     """The frames; of the account each marker in each frame is a row, by the number of its frame."""
-    time, position, names = group["time_ns"], group["position"], group["names"]
+    position, names = group["position"], group["names"]
     _check_names(place, names)
     for i, point in enumerate(group["p_body_marker"]):
         description.finite_vector(point, 3, place.path, f"p_body_marker[{i}]")
     said = group.get("visible", np.ones(position.shape[:2], bool))
     rows = [position, said] + [group[key] for key in ("quality", "error") if key in group]
-    order, account = intake.in_order(place, time, rows, sort=sort)
-    intake.check_rate(place, time[order])
-    kept, count = place.take(order), len(names)
-    each = np.repeat(np.arange(len(order)), count)
-    repeated = {
-        reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
-        for reason, r in account.dropped.items()
-    }
-    again = [r.time_ns for r in account.dropped.values()]
-    parts = {name: Part(len(time), np.concatenate([*again, time[:0]]), time[:0]) for name in names}
-    account = replace(account, rows=len(time) * count, dropped=repeated, parts=parts)
+    time, order, account = _frames(place, group["time_ns"], rows, names, sort)
+    each, count = np.repeat(np.arange(len(order)), len(names)), len(names)
     seen, account = intake.judge_markers(
-        kept.take(each),
-        time[order][each],
+        place.take(order).take(each),
+        time[each],
         position[order].reshape(-1, 3),
         np.tile(np.arange(count), len(order)),
         account,
@@ -80,7 +72,7 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
         )
     }
     return Markers(
-        time[order],
+        time,
         position[order],
         seen.reshape(len(order), count),
         names,
@@ -93,17 +85,65 @@ def markers(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers
     ), account
 
 
+def camera(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Camera, Intake]:
+    """The images; of the account each landmark in each image is a row, by the number of its image."""
+    pixel, names, sigma = group["pixel"], group["names"], group.get("sigma")
+    camera_storage.check_names(place, names)
+    camera_storage.check_places(place, group["p_ref_landmark"])
+    camera_storage.check_sigma(place, sigma)
+    said = camera_storage.optics(group, place.path)
+    shown = group.get("visible", np.ones(pixel.shape[:2], bool))
+    rows = [pixel, shown] if sigma is None else [pixel, shown, sigma]
+    slowest = intake.SLOWEST_TRACKER_S
+    time, order, account = _frames(place, group["time_ns"], rows, names, sort, slowest)
+    each = np.repeat(np.arange(len(order)), len(names))
+    found, account = intake.judge_points(
+        place.take(order).take(each),
+        time[each],
+        pixel[order].reshape(-1, 2),
+        account,
+        seen=shown[order].reshape(-1) if "visible" in group else None,
+    )
+    return Camera(
+        time,
+        pixel[order],
+        found.reshape(len(order), len(names)),
+        names,
+        group["p_ref_landmark"],
+        sigma=None if sigma is None else sigma[order],
+        latency_ns=int(group.get("latency_ns", 0)),
+        **said,
+    ), account
+
+
+def _frames(
+    place: Place,
+    time: Times,
+    rows: Sequence[Any],
+    names: tuple[str, ...],
+    sort: bool,
+    slowest_s: float = intake.SLOWEST_S,
+) -> tuple[Times, Indices, Intake]:
+    """Of frames that hold every part: their times and which they are, in order, and the account in which
+    each part of each frame is a row."""
+    order, account = intake.in_order(place, time, rows, sort=sort)
+    intake.check_rate(place, time[order], slowest_s)
+    count = len(names)
+    repeated = {
+        reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
+        for reason, r in account.dropped.items()
+    }
+    again = [r.time_ns for r in account.dropped.values()]
+    parts = {name: Part(len(time), np.concatenate([*again, time[:0]]), time[:0]) for name in names}
+    account = replace(account, rows=len(time) * count, dropped=repeated, parts=parts)
+    return time[order], order, account
+
+
 def _check_names(place: Place, names: tuple[str, ...]) -> None:
     """Each marker has a name of its own, such as a CSV file can hold."""
-    for i, name in enumerate(names):
-        if not name or name != name.strip() or not name.isprintable() or name in names[:i]:
-            raise place.error(
-                i,
-                "names",
-                repr(name),
-                "printable names, without blanks at their ends, each once",
-                "renaming the marker",
-            )
+    bad = bad_name(names)
+    if bad is not None:
+        raise place.error(bad, "names", repr(names[bad]), NAMES, "renaming the marker")
     if not names:
         raise place.error(None, None, "no marker", "at least one", "naming them in names")
 
@@ -133,10 +173,20 @@ def as_stored(stream: Any, group: Mapping[str, Any]) -> Any:
             near = np.abs(np.linalg.norm(stored, axis=1) - 1.0) <= intake.NORM_ROUNDED
         as_it_is = near | ~group["valid"] if "valid" in group else near
         kept["q_ref_body"] = np.where(as_it_is[:, None], stored, stream.q_ref_body)
+    if "q_body_camera" in group:
+        stored = group["q_body_camera"]
+        if abs(np.linalg.norm(stored) - 1.0) <= intake.NORM_ROUNDED:
+            kept["q_body_camera"] = stored
     if "scored" in group:
         kept["scored"] = group["scored"]
     return replace(stream, **kept)
 
 
-MAKERS = {"optical": optical, "markers": markers, "imu": imu, "encoder": encoder}
+MAKERS = {
+    "optical": optical,
+    "markers": markers,
+    "camera": camera,
+    "imu": imu,
+    "encoder": encoder,
+}
 """Of a place, arrays by name and whether to sort: a stream, and what became of its rows."""

@@ -1,8 +1,8 @@
 """A recorded run as one HDF5 or NPZ file: the same paths in both, to the last bit.
 
 The root says ``kind``, ``schema_version``, ``name``, ``info`` (TOML text) and ``sha256`` (of all values);
-the groups ``optical``, ``markers``, ``imu`` and ``encoder`` hold a stream each. What is said of a data set
-(``unit``, ``frame``) is an attribute in HDF5, and an entry ``optical/time_ns@unit`` in NPZ.
+the groups ``optical``, ``markers``, ``camera``, ``imu`` and ``encoder`` hold a stream each. What is said of
+a data set (``unit``, ``frame``) is an attribute in HDF5, and an entry ``optical/time_ns@unit`` in NPZ.
 `container_layout` has the list of data sets, `container_files` reads them.
 
 Whoever writes such a file without ``sha256`` (any program that writes HDF5) has its rows judged like those
@@ -131,7 +131,7 @@ def _check_declared(path: Path, arrays: Mapping[str, Any], said: Mapping[str, An
     """Types, shapes, units and frames are as documented, before any of it is read."""
     for label in STREAMS:
         sizes: dict[str, int] = {}
-        # Times and names first: they say how many samples and markers there are.
+        # Times and names first: they say how many samples, markers and landmarks there are.
         keys = [f"{label}/{name}" for name in layout.LAYOUT[label]]
         for key in (key for key in keys if key in arrays):
             field, stored = _field(key), arrays[key]

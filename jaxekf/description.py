@@ -14,6 +14,8 @@ from jaxekf.recording import NANOSECONDS, Floats
 
 SCHEMA_VERSION = 1
 FILE = "recording.toml"
+LANDMARKS = "landmarks.csv"
+"""The places of what `camera.csv` names."""
 BODY_TO_REFERENCE = "w,x,y,z, body to reference"
 _MENDING = f"correcting {FILE}"
 _LONGEST_LATENCY_S = 3600.0

@@ -25,6 +25,7 @@ from jaxekf.reverse_only import reverse_only
 from jaxekf.step import Moment
 from jaxekf.timeline import Rows, Steps
 
+_MANY_ROWS = 12
 Keep = Literal["everything", "estimates", "means"]
 _KEPT: dict[str, What] = {
     "everything": What(prior=True, cov=True, used=True),
@@ -233,6 +234,14 @@ def _innovations(
     return found
 
 
+def _nis(residual: Array, cov: Array) -> Array:
+    """``r' inv(S) r``; of many rows by LAPACK, for written out they would take minutes to compile."""
+    if residual.shape[0] <= _MANY_ROWS:
+        return linalg.squared_distance(residual, cov)
+    white = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(cov), residual, lower=True)
+    return jnp.sum(white * white)
+
+
 def _innovation(
     model: Model,
     sensor: Sensor,
@@ -249,7 +258,7 @@ def _innovation(
     spread = linalg.multiply_transposed(linalg.multiply(jacobian, prior.cov), jacobian)
     noise = linalg.mask_covariance(noise, rows.mask)
     cov = linalg.symmetrise(spread + noise)
-    nis = linalg.squared_distance(residual, cov)
+    nis = _nis(residual, cov)
     weight = outliers.weights(sensor, residual, cov, rows.mask)
     if weight is not None:
         weight = jnp.where(used, weight, 0.0)

@@ -243,6 +243,15 @@ def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
     return f"in the update by sensor {' and '.join(used)}"
 
 
+def _rejected(record: SensorRecord, copies: int) -> int:
+    """Samples, or where they are made of like groups these, of which the gate let nothing in."""
+    gated, used = (
+        np.asarray(flags).reshape(len(flags) * copies, -1).any(axis=1)
+        for flags in (record.gated, record.used)
+    )
+    return int((gated & ~used).sum())
+
+
 def model_sensors(line: Timeline) -> list[str]:
     """Names of all sensors of a timeline."""
     return [*line.steps.fast, *line.steps.slow]
@@ -279,7 +288,7 @@ def _collect(
                 " off",
             )
         if name in account:
-            rejected = int((record.gated.any(axis=1) & ~record.used.any(axis=1)).sum())
+            rejected = _rejected(record, model.sensor(name).copies)
             account[name]["gated"] = rejected
             fed = account[name].pop("fed")
             account[name]["used"] = fed - rejected

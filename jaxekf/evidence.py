@@ -3,6 +3,7 @@
 Measured, not judged: `plausible` judges. What the streams do not tell is NaN.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxekf import likeness
 from jaxekf.description import BODY_TO_REFERENCE
 from jaxekf.likeness import Fit, Turns
 from jaxekf.pose import from_markers
-from jaxekf.recording import NANOSECONDS, Floats, Imu, Markers, Optical, Recording, Times
+from jaxekf.recording import NANOSECONDS, STREAMS, Floats, Imu, Markers, Optical, Recording, Times
 from jaxekf.rows import Indices
 
 ALIKE = 0.8
@@ -97,8 +98,7 @@ def evidence(recording: Recording) -> Evidence:
         told["length_correlation"] = 1.0 if np.isfinite(told["length_ratio"]) else np.nan
     if tracker is None or imu is None:
         return Evidence(**told)
-    one, other = told["ranges_s"]["imu"], told["ranges_s"][tracker_label(recording)]
-    told["overlap_s"] = min(one[1], other[1]) - max(one[0], other[0])
+    told["overlap_s"] = overlap_s(told["ranges_s"], tracker_label(recording))
     if isinstance(tracker, Optical):
         rows = np.flatnonzero(tracker.valid)
         valid = tracker.valid.copy()
@@ -130,13 +130,22 @@ def evidence(recording: Recording) -> Evidence:
 
 def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
     found = {}
-    for label in ("optical", "markers", "imu", "encoder"):
+    for label in STREAMS:
         stream = getattr(recording, label)
         if stream is not None:
             late = getattr(stream, "latency_ns", 0)
             first, last = int(stream.time_ns[0]) - late, int(stream.time_ns[-1]) - late
             found[label] = (first / NANOSECONDS, last / NANOSECONDS)
     return found
+
+
+def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
+    """How long a stream and the IMU overlap; negative where one ends before the other begins, NaN where one
+    is not there."""
+    if label not in ranges_s or "imu" not in ranges_s:
+        return np.nan
+    one, other = ranges_s["imu"], ranges_s[label]
+    return min(one[1], other[1]) - max(one[0], other[0])
 
 
 def tracker_label(recording: Recording) -> str:

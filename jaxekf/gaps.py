@@ -25,8 +25,8 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
     """The run itself, or its parts between gaps of the IMU longer than 0.1 s (or three periods).
 
     Returns what can be estimated and, second, what cannot: parts shorter than half a second, or in which
-    the tracker sees nothing. Every row of the source belongs to one part: the tracker's samples in a gap
-    to the part before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
+    tracker and camera see nothing. Every row of the source belongs to one part: their samples in a gap to
+    the part before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
     """
     if recording.imu is None:
         return [recording], []
@@ -68,9 +68,10 @@ def _can_be_estimated(part: Recording) -> bool:
     taken = []
     if part.optical is not None:
         taken.append(part.optical.time_ns[part.optical.valid] - part.optical.latency_ns)
-    if part.markers is not None:
-        seen = part.markers.usable.any(axis=1)
-        taken.append(part.markers.time_ns[seen] - part.markers.latency_ns)
+    for stream in (part.markers, part.camera):
+        if stream is not None:
+            seen = stream.usable.any(axis=1)
+            taken.append(stream.time_ns[seen] - stream.latency_ns)
     return any(bool(((t >= first) & (t <= last)).any()) for t in taken)
 
 

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxekf.description import FILE
+from jaxekf.description import FILE, LANDMARKS
 from jaxekf.recording import STREAMS, Recording
 
 _READ = (".csv", ".json", ".toml", ".txt", ".yaml", ".yml")
@@ -14,15 +14,16 @@ _READ = (".csv", ".json", ".toml", ".txt", ".yaml", ".yml")
 def hashed(folder_or_file: Path | str) -> dict[str, str]:
     """Name and SHA-256, in hex, of each file that a recording is read from, in order of the names.
 
-    Of a recorded run's folder these are `recording.toml` and the streams' CSV files; of a folder in another
-    layout all tables and descriptions in it, by their paths in there; of a file that file. What cannot be
-    read is left out.
+    Of a recorded run's folder these are `recording.toml` and the CSV files of streams and landmarks; of a
+    folder in another layout all tables and descriptions in it, by their paths in there; of a file that
+    file. What cannot be read is left out.
     """
     path = Path(folder_or_file)
     if not path.is_dir():
         files = [path]
     elif (path / FILE).is_file():
-        files = [path / FILE, *(path / f"{label}.csv" for label in STREAMS)]
+        names = (FILE, *(f"{label}.csv" for label in STREAMS), LANDMARKS)
+        files = [path / name for name in names]
     else:
         files = [file for file in path.rglob("*") if file.suffix.lower() in _READ]
     found = {}

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxekf.alignment import RunAlignment, align_run, drifts
 from jaxekf.errors import RecordingError
+from jaxekf.evidence import overlap_s
 from jaxekf.plausible import Evidence, check, evidence
 from jaxekf.recording import NANOSECONDS, STREAMS, Flags, Recording, Times
 
@@ -65,6 +66,16 @@ class StreamFound(NamedTuple):
         return document | {"duration_s": self.end_s - self.begin_s}
 
 
+class PointsFound(NamedTuple):
+    """Landmarks in the images of a camera."""
+
+    landmarks: int
+    images: int
+    points_per_image: float
+    """Usable ones, on average over all images."""
+    images_without_points: int
+
+
 @dataclass(frozen=True)
 class Inspection:
     """What was found of one run."""
@@ -82,6 +93,8 @@ class Inspection:
     """What is as it is in good runs, too."""
     markers: dict[str, StreamFound] = field(default_factory=dict)
     """Single markers by their names."""
+    points: PointsFound | None = None
+    """None without a camera."""
 
     @property
     def verdict(self) -> str:
@@ -126,6 +139,7 @@ def inspect(recording: Recording) -> Inspection:
         tuple(warnings),
         tuple(notes),
         _markers(recording),
+        _points(recording),
     )
 
 
@@ -134,7 +148,7 @@ def _stream(recording: Recording, label: str) -> StreamFound:
     usable = np.ones(len(stream.time_ns), bool)
     if label in ("optical", "encoder"):
         usable = stream.valid
-    elif label == "markers":
+    elif label in ("markers", "camera"):
         usable = stream.usable.any(axis=1)
     account = recording.intake.get(label)
     masked, dropped = {}, {}
@@ -155,6 +169,14 @@ def _markers(recording: Recording) -> dict[str, StreamFound]:
         name: _found(time_ns, markers.usable[:, i], _hidden(markers.usable[:, i]), {})
         for i, name in enumerate(markers.names)
     }
+
+
+def _points(recording: Recording) -> PointsFound | None:
+    camera = recording.camera
+    if camera is None:
+        return None
+    count = camera.usable.sum(axis=1)
+    return PointsFound(len(camera.names), len(count), float(count.mean()), int((count == 0).sum()))
 
 
 def _hidden(usable: Flags) -> dict[str, int]:
@@ -220,17 +242,18 @@ def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
             f"the IMU has {len(long)} gaps of more than {_LONG_IMU_GAP_S:g} s, the longest of"
             f" {max(long):.2f} s: what is estimated within is made up"
         )
-    for label in ("optical", "markers"):
-        tracker = streams.get(label)
-        if tracker is None:
+    for label, name in (("optical", "tracker"), ("markers", "tracker"), ("camera", "camera")):
+        seeing = streams.get(label)
+        if seeing is None:
             continue
-        span = max(tracker.end_s - tracker.begin_s, 1e-9)
-        unseen = (tracker.gaps.lost_s + tracker.hidden.lost_s) / span
+        span = max(seeing.end_s - seeing.begin_s, 1e-9)
+        unseen = (seeing.gaps.lost_s + seeing.hidden.lost_s) / span
         if unseen > _SEEN_TOO_LITTLE:
-            warnings.append(f"the tracker sees nothing for {100.0 * unseen:.0f} % of its time")
-        if 0.0 <= found.overlap_s < _SEEN_TOO_LITTLE * span:
+            warnings.append(f"the {name} sees nothing for {100.0 * unseen:.0f} % of its time")
+        overlap = overlap_s(found.ranges_s, label)
+        if 0.0 <= overlap < _SEEN_TOO_LITTLE * span:
             warnings.append(
-                f"tracker and IMU overlap for {found.overlap_s:.1f} s of the tracker's {span:.1f} s"
+                f"{name} and IMU overlap for {overlap:.1f} s of the {name}'s {span:.1f} s"
             )
     return warnings
 

@@ -210,6 +210,28 @@ def judge_markers(
     return valid, account
 
 
+def judge_points(
+    place: Place,
+    time_ns: Times,
+    pixel: Floats,
+    account: Intake,
+    *,
+    seen: Flags | None = None,
+) -> tuple[Flags, Intake]:
+    """Which rows (N,), each of a landmark's image point (N, 2), are of one that was found; the others are
+    masked, by reason.
+
+    `seen` (N,) is what the source itself says of each row, where it does. Raises `RecordingError` where no
+    row is left.
+    """
+    blank = np.asarray(np.isnan(pixel).all(axis=1))
+    reasons = {} if seen is None else {"hidden": ~seen}
+    reasons |= {"blank": blank, "not finite": ~whole(pixel)}
+    valid, account = mask_first(place, time_ns, account, reasons)
+    need_usable(place, valid, account, place.unit, "a run in which landmarks are found")
+    return valid, account
+
+
 def in_order(
     place: Place,
     time_ns: Times,

@@ -204,11 +204,10 @@ def _linear(
     linear = {}
     for name, sample in samples.items():
         measurement = system.measurements[name]
-        found: Any = measurement.piece(
+        found = measurement(
             prepared[f"sensor {name}"], place.after, place.moment.u, sample, adjoint=adjoint
         )
-        residual, slope, noise = found
-        linear[name] = step.hide(measurement, residual, slope, noise, sample.mask)
+        linear[name] = step.hide(measurement, *found, sample.mask)
     return step.blocks_of_rows(system.measurements, linear)
 
 
@@ -239,7 +238,7 @@ def _ahead(
     prior = Gained(cov, missed + forth - back, jnp.zeros_like(delta[0]))
     gained = prior
     for slope, rows in _linear(system, prepared, place, samples, adjoint):
-        gained = algebra.take(slope, gained, rows)[0]
+        gained = step.take_block(slope, gained, rows, False)[0]
     cov = linalg.symmetrise(gained.cov)
     return (gained.delta, cov), _Forward(prior, gained.delta, cov)
 
@@ -267,7 +266,7 @@ def _epoch_back(
         gained = forward.prior
         taken = []
         for slope, rows in _linear(system, prepared, place, samples, adjoint):
-            gained, _, solved = algebra.take(slope, gained, rows, with_inverse=True)
+            gained, solved = step.take_keeping(slope, gained, rows)
             taken.append((slope, rows, solved))
         for slope, rows, solved in reversed(taken):
             info = backward.before_rows(slope, rows, solved, info)

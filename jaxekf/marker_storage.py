@@ -9,32 +9,20 @@ has no line, is hidden. The section ``[markers]`` holds `latency` (s), `quality_
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxekf import description, intake, stated
 from jaxekf.errors import RecordingError
+from jaxekf.frame_lines import NAMES, bad_name, frames, part_of_each_line
 from jaxekf.recording import Floats, Markers
-from jaxekf.rows import Intake, Part
-from jaxekf.tables import (
-    POSITION,
-    Sheet,
-    Table,
-    need_columns,
-    numbers,
-    reported,
-    stamps,
-    words,
-)
+from jaxekf.rows import Indices, Intake
+from jaxekf.tables import POSITION, Sheet, Table, need_columns, numbers, reported
 
 DESCRIBED = {"kind": "markers", "unit": "m"}
 LAYOUT = "time,marker,x,y,z[,quality][,error]"
-
-Indices = NDArray[np.intp]
 
 
 def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
@@ -53,46 +41,23 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     error = None if error is None else length * error
     quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
     columns = [a for a in (position, quality, error) if a is not None]
-    every = stamps(table)
-    order, account = intake.in_order(
-        table.place, every, columns, sort=source.sort, part=marker, parts=names
+    made, account = frames(table, columns, marker, names, sort=source.sort)
+    seen, account = intake.judge_markers(
+        table.place.take(made.lines), made.times, position[made.lines], made.part, account
     )
-    all_marker, times, marker = marker, every[order], marker[order]
-    intake.check_rate(table.place, np.unique(times))
-    first = np.concatenate([[True], np.diff(times) > 0])
-    frame = np.cumsum(first) - 1
-
-    def by_frame(lines: Floats | None) -> Any:
-        if lines is None:
-            return None
-        spread = np.full((frame[-1] + 1, len(names), *lines.shape[1:]), np.nan)
-        spread[frame, marker] = lines[order]
-        return spread
-
-    place_of_kept = table.place.take(order)
-    lines = np.bincount(all_marker, minlength=len(names))
-    there = np.zeros((frame[-1] + 1, len(names)), bool)
-    there[frame, marker] = True
-    gone = np.setdiff1d(np.arange(len(all_marker)), order)
-    parts = {
-        name: Part(int(lines[m]), every[gone[all_marker[gone] == m]], times[first][~there[:, m]])
-        for m, name in enumerate(names)
-    }
-    seen, account = intake.judge_markers(place_of_kept, times, position[order], marker, account)
-    account = replace(account, parts=parts)
-    position[order[~seen]] = np.nan
-    position = by_frame(position)
+    position[made.lines[~seen]] = np.nan
+    position = made.spread(position)
     stream = Markers(
-        times[first],
+        made.time_ns,
         position,
-        np.isfinite(position).all(axis=2),
+        np.asarray(np.isfinite(position).all(axis=2)),
         names,
         p_body_marker,
-        quality=by_frame(quality),
+        quality=None if quality is None else made.spread(quality),
         quality_min=description.finite_number(
             about.get("quality_min", 0.0), place, "markers.quality_min"
         ),
-        error=by_frame(error),
+        error=None if error is None else made.spread(error),
         latency_ns=description.latency_ns(about, "markers", place),
     )
     return stream, account
@@ -150,36 +115,30 @@ def _check_names(names: tuple[str, ...], place: Path | str) -> None:
             f"adding NAME = [x, y, z], in metres, under [{key}]",
             column=key,
         )
-    for i, name in enumerate(names):
-        if not name or name != name.strip() or not name.isprintable() or name in names[:i]:
-            raise RecordingError(
-                place,
-                f"{name!r} as marker {i + 1}",
-                "printable names, without blanks at their ends, each once",
-                "renaming the marker",
-                column=key,
-            )
+    bad = bad_name(names)
+    if bad is not None:
+        raise RecordingError(
+            place,
+            f"{names[bad]!r} as marker {bad + 1}",
+            NAMES,
+            "renaming the marker",
+            column=key,
+        )
 
 
 def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
     """Index (N,) into `names` of the marker that each line is of."""
-    index = {name: i for i, name in enumerate(names)}
-    cells = words(table, "marker")
-    kinds, which = np.unique(cells, return_inverse=True)
-    marker = np.array([index.get(str(kind), -1) for kind in kinds], np.intp)[which]
-    unknown = np.flatnonzero(marker < 0)
-    if unknown.size:
-        row = int(unknown[0])
-        name = str(cells[row])
+
+    def unknown(row: int, name: str) -> RecordingError:
         key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-        raise RecordingError(
-            table.path,
+        return table.error(
+            row,
+            "marker",
             f"marker '{name}'",
             f"one whose place in the body is given ({', '.join(names)})",
             f"adding {key} = [x, y, z], in metres, under [markers.geometry] in {description.FILE}"
             if name
             else "naming the marker or removing the line",
-            line=table.lines[row],
-            column="marker",
         )
-    return marker
+
+    return part_of_each_line(table, "marker", names, unknown)

@@ -6,10 +6,12 @@ it over time and maps it over runs. Nothing here knows a particular model.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxekf import manifold
@@ -86,6 +88,14 @@ class Sensor:
     likelihood is then that of the noise so enlarged."""
     aux_like: Any = None
     """Auxiliary data of an ordinary sample, where it needs any: for samples that come without."""
+    alike: "Sensor | None" = None
+    """One of the groups that a sample is made of, as a sensor of its own, where all are alike and many; see
+    `repeated`. None for a sensor whose sample is one thing."""
+
+    @property
+    def copies(self) -> int:
+        """Number of groups of a sample that is made of like ones; 1 for any other."""
+        return 1 if self.alike is None else self.rows // self.alike.rows
 
     @property
     def rows(self) -> int:
@@ -100,6 +110,43 @@ class Sensor:
             tuple(row for row, group in enumerate(groups) if group == name)
             for name in sorted(set(groups))
         )
+
+
+def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
+    """A sensor whose sample is `count` samples of `one`, such as all points of an image.
+
+    Value, rows and covariance are those of all groups one after the other; every leaf of `aux` has the
+    groups on its first axis. Each is gated, or counts less, by itself, and what the filter compiles
+    does not grow with their number. Gate, weighting and source are those of `one`, whose space must be
+    `Euclidean`; `labels` are those of all rows.
+
+    Raises `ModelError` for another space, for no group, or for a number of labels that is not the rows'.
+    """
+    if not isinstance(one.space, manifold.Euclidean) or one.alike is not None or count < 1:
+        raise ModelError(
+            f"sensor '{one.name}': got {count} groups in {type(one.space).__name__}, expected one or more"
+            " in Euclidean; give one group whose sample is a vector"
+        )
+    rows = one.rows
+    if labels and len(labels) != count * rows:
+        raise ModelError(
+            f"sensor '{one.name}': got {len(labels)} labels, expected {count * rows}; name every row"
+        )
+
+    def predict(x: Any, u: Any, params: Parameters, aux: Any) -> Array:
+        return jax.vmap(lambda a: one.predict(x, u, params, a), axis_size=count)(aux).reshape(-1)
+
+    def noise(params: Parameters, aux: Any, dt: Array) -> Array:
+        each = jax.vmap(lambda a: one.noise(params, a, dt), axis_size=count)(aux)
+        here = jnp.eye(count, dtype=each.dtype)[:, None, :, None]
+        return (here * each[:, :, None, :]).reshape(count * rows, count * rows)
+
+    like = jax.tree.map(lambda a: np.repeat(np.asarray(a)[None], count, axis=0), one.aux_like)
+    space = replace(one.space, size=count * rows, labels=tuple(labels))
+    groups = tuple(np.repeat(np.arange(count), rows).tolist())
+    return replace(
+        one, space=space, predict=predict, noise=noise, groups=groups, aux_like=like, alike=one
+    )
 
 
 @dataclass(frozen=True, eq=False)

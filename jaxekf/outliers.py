@@ -2,12 +2,13 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from scipy.stats import chi2
 
-from jaxekf import algebra, linalg
+from jaxekf import algebra, linalg, many
 from jaxekf.lanes import written_sum
 from jaxekf.model import Sensor
 from jaxekf.patterned import Pattern
@@ -16,6 +17,9 @@ from jaxekf.timeline import Rows
 
 _HUBER = 0.95
 """Share of honest samples that Huber's weight leaves alone."""
+_REACH = 7.0
+"""Of the belief that is widened: points are let in whose squared error is so many times larger than that of
+all in the mean, which of honest ones one in a thousand is."""
 _STUDENT = 4.0
 """Degrees of freedom of Student's law: its tails are heavy, its variance is finite."""
 
@@ -49,6 +53,13 @@ class _Group(NamedTuple):
     distance: Array
 
 
+class _Distance(NamedTuple):
+    """The same of each of many like groups, (groups, lanes)."""
+
+    visible: Array
+    distance: Array
+
+
 def judge(
     system: System,
     seen: dict[str, Linear],
@@ -73,7 +84,7 @@ def judge(
     for name in groups:
         if sensors[name].weighting is None:
             continue
-        larger = lessening(sensors[name], groups[name], linear[name].rows.mask.shape[0])
+        larger = _lessening(sensors[name], groups[name], linear[name].rows.mask.shape[-2])
         if recovered is not None:
             larger = jnp.where(recovered, 1.0, larger)
         linear[name] = _weighted(linear[name], larger)
@@ -107,6 +118,19 @@ def lessening(sensor: Sensor, groups: list[_Group], rows: int) -> Array:
     return jnp.stack(found)
 
 
+def _lessening(sensor: Sensor, groups: Any, rows: int) -> Array:
+    if not isinstance(groups, _Distance):
+        return lessening(sensor, groups, rows)
+    one = _alone(sensor)
+    return jax.vmap(lambda each: lessening(one, [_Group(tuple(range(rows)), *each)], rows))(groups)
+
+
+def _alone(sensor: Sensor) -> Sensor:
+    """One of the like groups of a sensor."""
+    assert sensor.alike is not None
+    return sensor.alike
+
+
 def _bound(share: Any, members: tuple[int, ...], visible: Array, like: Array) -> Array:
     """Which a `share` of honest squared distances of as many visible rows does not exceed; where none is
     visible, that of one."""
@@ -118,13 +142,18 @@ def _bound(share: Any, members: tuple[int, ...], visible: Array, like: Array) ->
 
 
 def _weighted(linear: Linear, larger: Array) -> Linear:
-    noise = linear.rows.noise
-    if noise.ndim == larger.ndim:
-        noise = noise * larger
+    if many.are_many(linear.rows.mask):
+        noise = jax.vmap(_enlarged)(linear.rows.noise, larger)
     else:
-        root = jnp.sqrt(larger)
-        noise = noise * root[:, None] * root[None]
+        noise = _enlarged(linear.rows.noise, larger)
     return linear._replace(rows=linear.rows._replace(noise=noise))
+
+
+def _enlarged(noise: Array, larger: Array) -> Array:
+    if noise.ndim == larger.ndim:
+        return noise * larger
+    root = jnp.sqrt(larger)
+    return noise * root[:, None] * root[None]
 
 
 def _without(linear: Linear, gated: Array) -> Linear:
@@ -137,7 +166,7 @@ def _gates(
     samples: dict[str, Rows],
     prior: Array,
     refused: Array | None,
-    groups: dict[str, list[_Group]],
+    groups: dict[str, Any],
 ) -> tuple[dict[str, Array], Array | None, Array | None, Array | None]:
     """Rows refused, seconds of refusing, where the gates were opened, and by how much to widen."""
     gated = {name: jnp.zeros_like(one.rows.mask) for name, one in seen.items()}
@@ -147,28 +176,102 @@ def _gates(
         return gated, None, None, None
     if not watched:
         return gated, refused, none, None
-    let_in, kept_out, finite = none, none, {}
-    refused_s, excess = jnp.zeros_like(refused), jnp.ones_like(refused)
+    ratios = {}
+    tally = _Tally(none, none, jnp.zeros_like(refused), jnp.ones_like(refused))
     for name in watched:
-        rows = seen[name].rows
-        gated[name], ratio = _gate(system.measurements[name].sensor, rows.mask, groups[name])
-        finite[name] = gated[name] & (jnp.stack(ratio) < jnp.inf)
-        for row in range(rows.mask.shape[0]):
-            let_in = let_in | (rows.mask[row] & ~gated[name][row])
-            kept_out = kept_out | finite[name][row]
-            larger = jnp.maximum(excess, ratio[row])
-            excess = jnp.where(finite[name][row], larger, excess)
-            late = jnp.maximum(refused_s, samples[name].dt)
-            refused_s = jnp.where(finite[name][row], late, refused_s)
+        given = (seen[name].rows.mask, groups[name], samples[name].dt)
+        tally, gated[name], ratios[name] = _counted(system.measurements[name].sensor, tally, *given)
+    let_in, kept_out, refused_s, excess = tally
     after = jnp.where(let_in, 0.0, refused + refused_s)
     # Earlier samples must have used up the patience: a single one is refused whatever its period.
     recovered = kept_out & ~let_in & (refused > system.model.patience_s)
-    gated |= {n: gated[n] & ~(finite[n] & recovered[None]) for n in watched}
+    for n in watched:
+        known = ratios[n] < jnp.inf
+        if isinstance(groups[n], _Distance):
+            # Most points of an image are honest and the others far off, also from a belief so widened.
+            known &= ratios[n] <= _REACH * jnp.broadcast_to(excess, known.shape)
+        gated[n] &= ~(known & jnp.broadcast_to(recovered, known.shape))
     widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
     return gated, jnp.where(recovered, 0.0, after), recovered, widened
 
 
-def _groups(sensor: Sensor, linear: Linear, prior: Array) -> list[_Group]:
+class _Tally(NamedTuple):
+    """What the gates did at one instant, each (lanes,)."""
+
+    let_in: Array
+    kept_out: Array
+    refused_s: Array
+    """The longest sampling period of what was refused."""
+    excess: Array
+    """How many times larger than expected the squared error of it is at most; of many like groups in the
+    geometric mean, in which a few that are far off count little."""
+
+
+def _counted(
+    sensor: Sensor, tally: _Tally, mask: Array, groups: Any, dt: Array
+) -> tuple[_Tally, Array, Array]:
+    """The tally with one more sensor, its rows that were refused, and for each row how many times larger
+    than expected its group's squared error is."""
+    if isinstance(groups, _Distance):
+        return _counted_many(_alone(sensor), tally, mask, groups, dt)
+    let_in, kept_out, refused_s, excess = tally
+    gated, ratio = _gate(sensor, mask, groups)
+    finite = gated & (jnp.stack(ratio) < jnp.inf)
+    for row in range(mask.shape[0]):
+        let_in = let_in | (mask[row] & ~gated[row])
+        kept_out = kept_out | finite[row]
+        excess = jnp.where(finite[row], jnp.maximum(excess, ratio[row]), excess)
+        refused_s = jnp.where(finite[row], jnp.maximum(refused_s, dt), refused_s)
+    return _Tally(let_in, kept_out, refused_s, excess), gated, jnp.stack(ratio)
+
+
+def _counted_many(
+    sensor: Sensor, tally: _Tally, mask: Array, groups: _Distance, dt: Array
+) -> tuple[_Tally, Array, Array]:
+    """The same with a sensor of many like groups, `sensor` being one of them.
+
+    It has let something in where it let in most of what it saw: by chance a few points always fit.
+    """
+    rows = tuple(range(mask.shape[1]))
+    zero = jnp.zeros_like(dt)
+
+    def one(carry: tuple[Array, Array, Array, Array], at: Any) -> tuple[Any, Any]:
+        balance, kept_out, number, logs = carry
+        mask, each = at
+        gated, ratio = _gate(sensor, mask, [_Group(rows, *each)])
+        refused, seen = gated[0], mask[0]
+        for row in rows[1:]:
+            refused, seen = refused | gated[row], seen | mask[row]
+        known = refused & (ratio[0] < jnp.inf)
+        balance = balance + jnp.where(refused, -1.0, jnp.where(seen, 1.0, 0.0))
+        log = jnp.log(jnp.where(known, jnp.maximum(ratio[0], 1.0), 1.0))
+        carry = (balance, kept_out | known, number + known.astype(dt.dtype), logs + log)
+        return carry, (gated, jnp.stack(ratio))
+
+    begin = (zero, jnp.zeros(dt.shape, bool), zero, zero)
+    (balance, refused, number, logs), (gated, ratio) = lax.scan(one, begin, (mask, groups))
+    larger = jnp.maximum(tally.excess, jnp.exp(logs / jnp.maximum(number, 1.0)))
+    return (
+        _Tally(
+            tally.let_in | (balance > 0.0),
+            tally.kept_out | refused,
+            jnp.where(refused, jnp.maximum(tally.refused_s, dt), tally.refused_s),
+            jnp.where(refused, larger, tally.excess),
+        ),
+        gated,
+        lax.stop_gradient(ratio),
+    )
+
+
+def _groups(sensor: Sensor, linear: Linear, prior: Array) -> Any:
+    """Distances of the groups of a sensor: `_Group` of each, or `_Distance` of many like ones."""
+    if many.are_many(linear.rows.mask):
+
+        def one(_: None, rows: algebra.Rows) -> tuple[None, Any]:
+            (found,) = _groups(_alone(sensor), linear._replace(rows=rows), prior)
+            return None, _Distance(found.visible, found.distance)
+
+        return lax.scan(one, None, linear.rows)[1]
     rows = linear.rows
     # What is differentiated by closed forms counts on symmetric cotangents of covariances.
     cov = linalg.symmetrise(

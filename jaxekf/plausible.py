@@ -9,7 +9,15 @@ import numpy as np
 
 from jaxekf.description import BODY_TO_REFERENCE, FILE
 from jaxekf.errors import RecordingError
-from jaxekf.evidence import ALIKE, DEGREES, EXPLAINED, Evidence, evidence, tracker_label
+from jaxekf.evidence import (
+    ALIKE,
+    DEGREES,
+    EXPLAINED,
+    Evidence,
+    evidence,
+    overlap_s,
+    tracker_label,
+)
 from jaxekf.recording import Recording
 
 __all__ = ["Evidence", "check", "evidence", "require"]
@@ -43,8 +51,9 @@ def require(recording: Recording) -> None:
 
 def check(recording: Recording, found: Evidence) -> None:
     """As `require`, with the evidence at hand."""
-    if found.overlap_s < 0.0:
-        raise _apart(recording, found)
+    for label in (tracker_label(recording), "camera"):
+        if overlap_s(found.ranges_s, label) < 0.0:
+            raise _apart(recording, found, label)
     _check_truth(recording)
     force = _force(recording, found)
     rate = None
@@ -160,8 +169,7 @@ def _check_order(recording: Recording, found: Evidence) -> None:
     )
 
 
-def _apart(recording: Recording, found: Evidence) -> RecordingError:
-    label = tracker_label(recording)
+def _apart(recording: Recording, found: Evidence, label: str) -> RecordingError:
     words = [
         f"{name} from {_seconds(found.ranges_s[name][0])} to {_seconds(found.ranges_s[name][1])} s"
         for name in (label, "imu")
@@ -177,7 +185,8 @@ def _apart(recording: Recording, found: Evidence) -> RecordingError:
 def _check_truth(recording: Recording) -> None:
     """Truth of another time than what it is the truth of."""
     truth = recording.encoder
-    others = [s for s in (recording.optical, recording.markers, recording.imu) if s is not None]
+    streams = (recording.optical, recording.markers, recording.camera, recording.imu)
+    others = [stream for stream in streams if stream is not None]
     if truth is None or not others:
         return
     first = min(int(stream.time_ns[0]) for stream in others)

@@ -23,7 +23,7 @@ Flags = NDArray[np.bool_]
 
 NANOSECONDS = 1_000_000_000
 
-STREAMS = ("optical", "markers", "imu", "encoder")
+STREAMS = ("optical", "markers", "camera", "imu", "encoder")
 """What a recording may hold."""
 
 
@@ -47,6 +47,11 @@ class Samples:
     """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
     thinned: int = 0
     """Samples of that stream that are left out here because so many tell nothing more."""
+    points: Times | None = None
+    """(N,) where a sample is made of like groups, such as the points of an image: how many of them the
+    source has; the account counts these. None where a sample is one row of the source."""
+    copies: int = 1
+    """Groups in a sample, those included that only fill it up."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,67 @@ class Markers:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """Where landmarks of known places appear in the images of a camera that is fixed to the body."""
+
+    time_ns: Times
+    """Stamps of the images; an image was taken `latency_ns` before."""
+    pixel: Floats
+    """(N, L, 2) image points, pixels, u to the right and v down; of a landmark that was not found
+    anything."""
+    visible: Flags
+    """(N, L) whether the landmark was found in the image."""
+    names: tuple[str, ...]
+    p_ref_landmark: Floats
+    """(L, 3) metres: the landmarks in the reference frame."""
+    focal: Floats
+    """(2,) focal lengths, pixels."""
+    centre: Floats
+    """(2,) image point of the optical axis, pixels."""
+    radial: Floats = field(default_factory=lambda: np.zeros(2))
+    """(2,) of the lens: a point r from the axis appears ``1 + radial[0] r^2 + radial[1] r^4`` times as far
+    from it, r in focal lengths."""
+    p_body_camera: Floats = field(default_factory=lambda: np.zeros(3))
+    """(3,) metres: the camera's centre in the body frame (the IMU's)."""
+    q_body_camera: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    """(4,) camera to body; the camera looks along its z, x is to the right and y down in the image."""
+    sigma: Floats | None = None
+    """(N, L) reported standard deviation of an image point, pixels; NaN where none was reported."""
+    latency_ns: int = 0
+
+    per_sample: ClassVar = ("pixel", "visible", "sigma")
+
+    @cached_property
+    def usable(self) -> Flags:
+        """(N, L): found, and finite."""
+        return self.visible & np.isfinite(self.pixel).all(axis=2)
+
+    def __post_init__(self) -> None:
+        count, images = len(self.names), len(self.time_ns)
+        shapes = {
+            "pixel": (images, count, 2),
+            "visible": (images, count),
+            "p_ref_landmark": (count, 3),
+            "focal": (2,),
+            "centre": (2,),
+            "radial": (2,),
+            "p_body_camera": (3,),
+            "q_body_camera": (4,),
+        }
+        if self.sigma is not None:
+            shapes["sigma"] = (images, count)
+        for key, shape in shapes.items():
+            got = np.shape(getattr(self, key))
+            if got != shape:
+                raise RecordingError(
+                    "camera",
+                    f"{key} of shape {got}",
+                    f"{shape} for {images} images of {count} landmarks",
+                    "giving every landmark its place in the scene and in every image",
+                )
+
+
+@dataclass(frozen=True)
 class Imu:
     """Gyroscope, and where recorded accelerometer and magnetometer, in the body frame."""
 
@@ -164,6 +230,7 @@ class Recording:
     ``q_body_object`` (the point and frame of the tool that is asked for), licence, seed."""
     path: Path | None = None
     markers: Markers | None = None
+    camera: Camera | None = None
     intake: Mapping[str, Intake] = field(default_factory=dict)
     """What became of the rows of each stream's source while it was read; empty of a run made in memory."""
     sources: Mapping[str, str] = field(default_factory=dict)
@@ -193,6 +260,10 @@ class Recording:
     def need_markers(self) -> Markers:
         """The markers, or an error that names the run."""
         return self._need("markers")
+
+    def need_camera(self) -> Camera:
+        """The camera, or an error that names the run."""
+        return self._need("camera")
 
     def need_imu(self) -> Imu:
         """The IMU stream, or an error that names the run."""

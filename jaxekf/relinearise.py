@@ -20,7 +20,7 @@ from jaxekf.algebra import Gained
 from jaxekf.kernels import loop
 from jaxekf.model import Belief
 from jaxekf.outliers import Linear
-from jaxekf.step import any_of, blocks_of_rows, hide, take_block
+from jaxekf.step import any_used, blocks_of_rows, hide, take_block
 from jaxekf.system import System
 
 
@@ -70,7 +70,7 @@ class Again:
                 smallest = jnp.minimum(smallest, pivot)
             moved, reset = self._system.move(prepared["move"], x, before.delta, adjoint=adjoint)
             posterior = Belief(moved, turned(reset, before.cov))
-        used = any_of([one.rows.mask for one in linear.values()])
+        used = any_used(linear)
         return _where(used, posterior, found), jnp.where(used, smallest, 1.0)
 
     def _looked(
@@ -81,7 +81,7 @@ class Again:
         for name, sample in samples.items():
             measurement = self._system.measurements[name]
             constants = prepared[f"sensor {name}"]
-            residual, slope, _ = measurement.piece(constants, x, u, sample, adjoint=adjoint)
+            residual, slope, _ = measurement(constants, x, u, sample, adjoint=adjoint)
             first = linear[name].rows
             rows[name] = hide(measurement, residual, slope, first.noise, first.mask)
         return rows

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 from typing import Any, Literal, get_args
 
 from jaxekf.errors import ModelError
-from jaxekf.model import Model
+from jaxekf.model import Model, Sensor
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 
@@ -40,9 +40,14 @@ def _robust(model: Model, means: Means, probability: float) -> Model:
         "gate": probability if means == "gate" else None,
         "weighting": means if means in ("huber", "student") else None,
     }
-    sensors = tuple(replace(sensor, **changes) for sensor in model.sensors)
+    sensors = tuple(_changed(sensor, changes) for sensor in model.sensors)
     adapt = None if model.adapt is None else partial(_adapted, model, means, probability)
     return replace(model, sensors=sensors, adapt=adapt)
+
+
+def _changed(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
+    alike = None if sensor.alike is None else replace(sensor.alike, **changes)
+    return replace(sensor, alike=alike, **changes)
 
 
 def _adapted(

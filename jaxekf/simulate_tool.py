@@ -214,12 +214,16 @@ def tool_markers(
 
 
 def tool_imu(
-    motion: ToolMotion, time_ns: Times, rng: np.random.Generator, grade: ToolGrade
+    motion: ToolMotion,
+    time_ns: Times,
+    rng: np.random.Generator,
+    grade: ToolGrade,
+    gravity_ref: Floats = GRAVITY_REF,
 ) -> tuple[Imu, Floats, Floats]:
     """Gyroscope and accelerometer with white noise, and the biases, which walk, of each."""
     t = seconds(time_ns)
     q, rate = motion.attitude.attitude(t)
-    force = to_scipy(q).inv().apply(motion.acceleration(t) - GRAVITY_REF)
+    force = to_scipy(q).inv().apply(motion.acceleration(t) - gravity_ref)
     turning, bias = _biased(
         rate,
         rng,

@@ -50,6 +50,11 @@ SECTION_KEYS = (
     "p_body_tool",
     "quality_min",
     "geometry",
+    "focal",
+    "centre",
+    "radial",
+    "p_body_camera",
+    "q_body_camera",
     "axis",
     "acts_on",
     "q_zero",
@@ -63,10 +68,12 @@ _RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 _FORCE = {"m/s^2": 1.0, "g": 9.80665, "mm/s^2": 1e-3}
 _ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
 _ONE = {"1": 1.0}
+_PIXEL = {"px": 1.0}
 _UNITS: dict[str, tuple[dict[str, float], ...]] = {
     "imu": (_RATE, _FORCE),
     "optical": (_ONE, _LENGTH),
     "markers": (_LENGTH,),
+    "camera": (_LENGTH, _PIXEL),
     "joint": (_ANGLE,),
     "encoder": (_ONE, _LENGTH),
 }

@@ -1,13 +1,14 @@
 """One step of the filter on lanes: predict, compare, update."""
 
 import operator
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
-from jaxekf import algebra, linalg, outliers, patterned
+from jaxekf import algebra, linalg, many, outliers, patterned
 from jaxekf.algebra import Gained
 from jaxekf.model import Belief
 from jaxekf.outliers import Judged, Linear
@@ -92,20 +93,19 @@ def update(
     prior = ahead.belief
     judged, cov = look(system, prepared, ahead, u, samples, adjoint=adjoint)
     linear = judged.linear
-    used = {name: one.rows.mask for name, one in linear.items()}
+    used = {name: many.flat(one.rows.mask) for name, one in linear.items()}
+    gated = {name: many.flat(mask) for name, mask in judged.gated.items()}
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
         nothing, sound = jnp.zeros(lanes, dtype), _is_sound(prior.cov)
         never = None if ahead.refused is None else jnp.zeros(lanes, bool)
-        return Outcome(prior, ahead, nothing, sound, used, judged.gated, never)
+        return Outcome(prior, ahead, nothing, sound, used, gated, never)
     gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
     for slope, rows in blocks_of_rows(system.measurements, linear):
         gained, pivot = take_block(slope, gained, rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
-    posterior = _correct(
-        system, prepared["correction"], prior, gained, list(used.values()), adjoint
-    )
+    posterior = _correct(system, prepared["correction"], prior, gained, any_used(linear), adjoint)
     if system.again is not None:
         widened = Belief(prior.mean, cov)
         posterior, pivot = system.again(
@@ -114,7 +114,7 @@ def update(
         smallest = jnp.minimum(smallest, pivot)
     healthy = (smallest > 0.0) & _is_sound(posterior.cov)
     after = Track(posterior, judged.refused)
-    told = (used, judged.gated, judged.recovered)
+    told = (used, gated, judged.recovered)
     return Outcome(prior, after, gained.log_likelihood, healthy, *told)
 
 
@@ -134,9 +134,8 @@ def look(
     for name, sample in samples.items():
         measurement = system.measurements[name]
         constants = prepared[f"sensor {name}"]
-        found: Any = measurement.piece(constants, prior.mean, u, sample, adjoint=adjoint)
-        residual, slope, noise = found
-        seen[name] = hide(measurement, residual, slope, noise, sample.mask)
+        found = measurement(constants, prior.mean, u, sample, adjoint=adjoint)
+        seen[name] = hide(measurement, *found, sample.mask)
     judged = outliers.judge(system, seen, samples, prior.cov, ahead.refused)
     cov = prior.cov if judged.widened is None else prior.cov * judged.widened[None, None]
     return judged, cov
@@ -161,21 +160,49 @@ def hide(
     measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
 ) -> Linear:
     """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
+    if many.are_many(residual):
+        mask = mask.reshape(residual.shape)
+        hidden = jax.vmap(partial(_hide, measurement))(residual, slope, noise, mask)
+    else:
+        hidden = _hide(measurement, residual, slope, noise, mask)
+    return Linear(measurement.slope, hidden)
+
+
+def _hide(
+    measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
+) -> algebra.Rows:
     if slope is not None:
         rows = patterned.take(mask, measurement.slope.rows, 0)
         slope = jnp.where(rows[:, None], slope, 0.0)
     both = mask if measurement.diagonal else mask[:, None] & mask[None]
     noise = jnp.where(both, noise, 0.0)
-    return Linear(measurement.slope, algebra.Rows(residual, slope, noise, mask))
+    return algebra.Rows(residual, slope, noise, mask)
 
 
 def take_block(
     slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool
 ) -> tuple[Gained, Array]:
     """A block of rows taken at once, and the smallest pivot met."""
+    if many.are_many(rows.mask):
+
+        def one(carry: tuple[Gained, Array], rows: algebra.Rows) -> tuple[Any, None]:
+            gained, pivot = take_block(slope, carry[0], rows, adjoint)
+            # Rounding that is not symmetric grows from one group to the next.
+            gained = gained._replace(cov=linalg.symmetrise(gained.cov))
+            return (gained, jnp.minimum(carry[1], pivot)), None
+
+        return lax.scan(one, (gained, jnp.ones_like(gained.log_likelihood)), rows)[0]
     if adjoint:
         return algebra.update_with_adjoint(slope, rows.noise.ndim == 2)(gained, rows)
     return algebra.update(slope, gained, rows)
+
+
+def take_keeping(slope: Pattern, gained: Gained, rows: algebra.Rows) -> tuple[Gained, Any]:
+    """A block of rows taken at once, and what the way back through it needs."""
+    if many.are_many(rows.mask):
+        return lax.scan(lambda gained, rows: take_keeping(slope, gained, rows), gained, rows)
+    gained, _, solved = algebra.take(slope, gained, rows, with_inverse=True)
+    return gained, solved
 
 
 def blocks_of_rows(
@@ -186,6 +213,8 @@ def blocks_of_rows(
     size = 0
     for name, one in linear.items():
         rows = one.slope.shape[0]
+        if many.are_many(one.rows.mask):
+            rows = _LARGEST_BLOCK + 1  # Groups that are taken one after the other stand alone.
         if groups and size + rows <= _LARGEST_BLOCK:
             groups[-1].append(name)
             size += rows
@@ -228,21 +257,17 @@ def _block_diagonal(matrices: list[Array]) -> Array:
     return jnp.concatenate(rows)
 
 
-def any_of(masks: list[Array]) -> Array:
-    """(lanes,) where any row of any mask counts."""
-    every = [mask[i] for mask in masks for i in range(mask.shape[0])]
-    return reduce(operator.or_, every)
+def any_used(linear: dict[str, Linear]) -> Array:
+    """(lanes,) where any row of any sensor counts."""
+    return reduce(operator.or_, [many.any_row(one.rows.mask) for one in linear.values()])
 
 
 def _correct(
-    system: System, constants: Any, prior: Belief, gained: Gained, masks: list[Array], adjoint: bool
+    system: System, constants: Any, prior: Belief, gained: Gained, used: Array, adjoint: bool
 ) -> Belief:
-    """The mean moved by the error vector and the covariance counted from there."""
-    any_used = any_of(masks)
+    """The mean moved by the error vector and the covariance counted from there, where rows were `used`."""
     correction = system.correction
-    mean, reset, _ = correction.piece(
-        constants, prior.mean, gained.delta, any_used, adjoint=adjoint
-    )
+    mean, reset, _ = correction.piece(constants, prior.mean, gained.delta, used, adjoint=adjoint)
     if correction.reset.is_identity:
         # Symmetric but for rounding, which the next prediction ends.
         return Belief(mean, gained.cov)

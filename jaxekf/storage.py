@@ -1,7 +1,8 @@
-"""Recorded runs on disk: a folder with `recording.toml` and one CSV file a stream.
+"""Recorded runs on disk: a folder with `recording.toml` and one CSV file a stream, of a camera two.
 
 ``optical.csv``  time,qw,qx,qy,qz[,x,y,z][,status][,error]
 ``markers.csv``  time,marker,x,y,z[,quality][,error]       (`marker_storage`)
+``camera.csv``   time,landmark,u,v[,sigma], and ``landmarks.csv``  landmark,x,y,z  (`camera_storage`)
 ``imu.csv``      time,gx,gy,gz[,ax,ay,az][,mx,my,mz]
 ``encoder.csv``  time,angle[,scored]  or  time,qw,qx,qy,qz[,x,y,z][,scored]  (`encoder_storage`)
 
@@ -13,12 +14,14 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
 
 from jaxekf import (
+    camera_storage,
     containers,
     description,
     encoder_storage,
@@ -98,9 +101,11 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
             table = read_table(file, how)
-            _check_hash(table, hashes)
-            sources[file.name] = table.text.sha256
-            stream, account = form.read(table, Source(section, place, sort))
+            tables = [table, *(_beside(folder / name, file.name) for name in form.beside)]
+            for one in tables:
+                _check_hash(one, hashes)
+                sources[one.path.name] = one.text.sha256
+            stream, account = form.read(table, Source(section, place, sort), *tables[1:])
             read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
         files = " or ".join(f"{label}.csv" for label in _FORMS)
@@ -110,6 +115,13 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     info |= {f"{key}_about": _left(about[key], _FORMS[key]) for key in _FORMS if key in about}
     name = str(about.get("name", folder.resolve().name))
     return Recording(name, **read, info=info, path=folder, intake=accounts, sources=sources)
+
+
+def _beside(path: Path, file: str) -> Table:
+    """A second file of a stream, whose layout is fixed."""
+    if not path.exists():
+        raise RecordingError(path, "no such file", f"one beside {file}", "adding it")
+    return read_table(path)
 
 
 def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
@@ -195,6 +207,8 @@ def save(
             section = _left(recording.info.get(f"{label}_about", {}), form)
             sheet, about[label] = form.write(stream, section)
             write_sheet(folder / f"{label}.csv", sheet, digits)
+            for name, write_beside in form.beside.items():
+                write_beside(stream, folder / name)
         if hashes:
             about["sha256"] = {
                 file.name: hashlib.sha256(file.read_bytes()).hexdigest()
@@ -290,12 +304,15 @@ def _write_imu(stream: Imu, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
 class _Form(NamedTuple):
     """How a stream of `Recording` is held on disk."""
 
-    read: Callable[[Table, Source], tuple[Any, Intake]]
+    read: Callable[..., tuple[Any, Intake]]
+    """Of its table, its source and the tables of the files `beside`: the stream and its account."""
     write: Callable[[Any, dict[str, Any]], tuple[Sheet, dict[str, Any]]]
     described: Mapping[str, str]
     """What its section of `recording.toml` says, where it says it."""
     held: tuple[str, ...] = ()
     """Entries of its section that the stream itself holds once it is read."""
+    beside: Mapping[str, Callable[[Any, Path], None]] = MappingProxyType({})
+    """Names of further files that it needs, and what writes them."""
 
 
 _FORMS = {
@@ -310,6 +327,13 @@ _FORMS = {
         marker_storage.write,
         marker_storage.DESCRIBED,
         ("latency", "quality_min", "geometry"),
+    ),
+    "camera": _Form(
+        camera_storage.read,
+        camera_storage.write,
+        camera_storage.DESCRIBED,
+        camera_storage.HELD,
+        {description.LANDMARKS: camera_storage.write_landmarks},
     ),
     "imu": _Form(_read_imu, _write_imu, {"kind": "imu", "frame": "body", "unit": "rad/s, m/s^2"}),
     "encoder": _Form(encoder_storage.read, encoder_storage.write, encoder_storage.DESCRIBED),

@@ -28,6 +28,15 @@ def first_visible(samples: Samples) -> Any:
 def count(samples: Samples, start: int, end: int) -> dict[str, int]:
     """The account of a stream in a run from `start` to `end`, ns."""
     inside = (samples.time_ns >= start) & (samples.time_ns <= end)
+    if samples.points is not None:
+        groups = samples.mask.reshape(len(samples.mask), samples.copies, -1).any(axis=2)
+        seen, there = groups.sum(axis=1), samples.points
+        return {
+            "read": int(there.sum()),
+            "fed": int(seen[inside].sum()),
+            "masked": int((there - seen)[inside].sum()),
+            "dropped_outside_run": int(there[~inside].sum()),
+        }
     shown = visible(samples)
     account = {
         "read": len(samples.time_ns) + samples.thinned,
@@ -82,6 +91,7 @@ def take(samples: Samples, chosen: NDArray[Any]) -> Samples:
         value=pick(samples.value),
         mask=samples.mask[chosen],
         aux=pick(samples.aux),
+        points=pick(samples.points),
     )
 
 

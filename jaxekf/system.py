@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from jaxekf import linalg, linearise, manifold, patterned, programs, scalars, structure
+from jaxekf import linalg, linearise, manifold, many, patterned, programs, scalars, structure
 from jaxekf.model import Model, Sensor
 from jaxekf.patterned import Pattern
 from jaxekf.programs import Program
+from jaxekf.timeline import Rows
 
 
 class Piece:
@@ -130,6 +131,23 @@ class Measurement(NamedTuple):
     """``(params, x, u, rows)`` to the residual, the unknown block of H, and the noise."""
     slope: Pattern
     diagonal: bool
+
+    def __call__(
+        self, constants: Any, x: Any, u: Any, rows: Rows, *, adjoint: bool
+    ) -> tuple[Array, Array | None, Array]:
+        """Residual, unknown block of the slope, and noise of a sample on lanes.
+
+        Of a sample that is made of like groups each of them has the groups on its first axis.
+        """
+        if self.sensor.alike is None:
+            return self.piece(constants, x, u, rows, adjoint=adjoint)
+        # One after the other: the derivative by what they share is then a sum, one term at a time.
+        groups = many.apart(rows, self.sensor.copies)
+
+        def one(_: None, group: Any) -> tuple[None, Any]:
+            return None, self.piece(constants, x, u, rows._replace(**group), adjoint=adjoint)
+
+        return lax.scan(one, None, groups)[1]
 
 
 class Correction(NamedTuple):
@@ -245,7 +263,10 @@ def measurement(
     rows: Any,
     linearised: Callable[..., Any] = linearise.linearise_sensor,
 ) -> Measurement:
-    function = partial(linearised, model, sensor)
+    one = sensor if sensor.alike is None else sensor.alike
+    if sensor.alike is not None:
+        rows = many.one_of(rows, sensor.copies)
+    function = partial(linearised, model, one)
     whole = known(function, params, x, u, rows)
     slope = patterned.pattern(whole[1])
     diagonal = is_diagonal(whole[2])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxekf import ekf, jit, kernels
 from jaxekf.model import Parameters
 from jaxekf.models import loose, loose_additive, loose_rate, tight
-from jaxekf.recording import Imu, Markers, Optical, Recording, from_scipy
+from jaxekf.recording import Camera, Imu, Markers, Optical, Recording, from_scipy
 from jaxekf.timeline import Knots, Rows, Steps
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
@@ -272,6 +272,23 @@ def recording(seed, *, rest=False, start_ns=0, turn=None, turn_rate=False):
     visible = valid[:, None] & np.ones((1, 3), bool)
     visible[1 + (seed + 2) % 5, 1] = False
     markers = Markers(start_ns + optical_ns, seen, visible, ("1", "2", "3"), ARMS)
+    camera = _camera(rng, start_ns + optical_ns, exact, valid, scale, turn)
     info = {"gravity_ref": gravity.tolist(), "field_ref": field.tolist()}
     imu = Imu(start_ns + imu_ns, gyroscope, up, magnetic)
-    return Recording("simulated", optical, imu, None, info, markers=markers)
+    return Recording("simulated", optical, imu, None, info, markers=markers, camera=camera)
+
+
+def _camera(rng, time_ns, q, valid, scale, turn):
+    """Eight landmarks ahead of a camera at the body's origin, in images taken with the tracker's samples;
+    one is not found in one of them. `turn` turns the landmarks."""
+    lens = np.array([200.0, 210.0]), np.array([160.0, 120.0])
+    places = np.random.default_rng(61).uniform([-1.5, -1.5, 3.5], [1.5, 1.5, 5.0], (8, 3))
+    if turn is not None:
+        places = rotation_of(turn[None])[0].apply(places)
+    seen = np.stack([rotation_of(q).inv().apply(place) for place in places], axis=1)
+    pixel = lens[0] * seen[..., :2] / np.maximum(seen[..., 2:], 0.1) + lens[1]
+    pixel += scale * 0.7 * rng.standard_normal(pixel.shape)
+    found = valid[:, None] & (seen[..., 2] > 1.0)
+    found[3, 2] = False
+    names = tuple(f"L{i}" for i in range(len(places)))
+    return Camera(time_ns, pixel, found, names, places, *lens)

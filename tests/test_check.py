@@ -12,6 +12,8 @@ from jaxekf import simulate, simulate_tool, storage
 from jaxekf.cli import main
 from jaxekf.datasets import asl, broad
 from jaxekf.inspection import find_gaps, inspect
+from jaxekf.plots.timeaxis import time_axis
+from jaxekf.recording import Camera
 from jaxekf.rows import Intake, Reason
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
@@ -101,6 +103,58 @@ def test_folder_with_pictures(tmp_path):
     again = run_check(*paths, "-o", out)
     assert again.exit_code == 1 and "a path that exists" in again.stderr
     assert run_check(*paths, "-o", out, "--overwrite").exit_code == done.exit_code
+
+
+def seen_by_camera(run):
+    """A run with a camera instead of a tracker: five landmarks, three found at most, and none from 3 to
+    5 s."""
+    time_ns = run.imu.time_ns[0] + np.arange(0, 12, 0.1) * 1e9
+    visible = np.tile([True, True, True, False, False], (len(time_ns), 1))
+    visible[::2, 0] = False
+    visible[30:50] = False
+    camera = Camera(
+        time_ns.astype(np.int64),
+        np.where(visible[..., None], [100.0, 200.0], np.nan),
+        visible,
+        ("A", "B", "C", "D", "E"),
+        np.eye(5, 3),
+        np.full(2, 400.0),
+        np.full(2, 320.0),
+    )
+    return run.replace(optical=None, camera=camera)
+
+
+def test_a_camera(tmp_path):
+    """Would catch a camera that check passes over, images with some landmark hidden called masked, or
+    without any called seen."""
+    run = seen_by_camera(free(0))
+    path, out = storage.save(run, tmp_path / "run"), tmp_path / "checked"
+    done = run_check(path, "-o", out)
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.stdout.split())
+    assert "camera 120 100 10.000 0.000 11.900 0" in told
+    assert "camera: 2.1 of 5 landmarks in an image on average, 20 of 120 images without any" in told
+    assert sorted(f.name for f in out.iterdir()) == ["check.json", "check_free-0.png"]
+    document = json.loads((out / "check.json").read_text())["runs"][0]
+    found = document["streams"]["camera"]
+    assert found["points_per_image"] == pytest.approx(250 / 120)
+    assert found["images_without_points"] == 20 and found["landmarks"] == 5
+    assert found["hidden"]["count"] == 1
+    assert found["hidden"]["lost_s"] == pytest.approx(2.0)
+    assert found["masked"] == {"blank": 350}
+    assert found["gaps"]["count"] == 0
+    made = storage.load(path)
+    figure = time_axis(made, inspect(made))
+    lanes, legend = figure.axes[0], figure.legends[0]
+    assert [label.get_text() for label in lanes.get_yticklabels()] == ["camera", "imu"]
+    assert [text.get_text() for text in legend.get_texts()][1:] == ["no landmark found"]
+    assert "10 Hz\n17 % masked" in [text.get_text() for text in lanes.texts]
+    seldom = replace(made.camera, visible=made.camera.visible & (np.arange(120) < 40)[:, None])
+    assert inspect(made.replace(camera=seldom)).warnings == (
+        "the camera sees nothing for 75 % of its time",
+    )
+    moved = replace(made.camera, time_ns=made.camera.time_ns + 9_000_000_000)
+    assert "camera and IMU overlap for 3.0 s" in inspect(made.replace(camera=moved)).warnings[0]
 
 
 def test_what_is_warned_of():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import jaxekf
 from jaxekf import containers, simulate, simulate_tool
 from jaxekf.errors import RecordingError
-from jaxekf.recording import STREAMS, Encoder, Imu, Optical, Recording
+from jaxekf.recording import STREAMS, Camera, Encoder, Imu, Optical, Recording
 
 BIG = 1_700_000_000_123_456_789
 SUFFIXES = [".h5", ".npz"]
@@ -56,7 +56,31 @@ def bare_run():
     return run.replace(optical=optical, imu=Imu(run.imu.time_ns, run.imu.gyroscope), encoder=None)
 
 
-RUNS = [pose_run, marker_run, bare_run]
+def camera_run():
+    """A camera beside the IMU: points of landmarks that are not found are NaN, as folders give them."""
+    run = pose_run()
+    draw, shape = np.random.default_rng(4), (9, 5)
+    visible = draw.random(shape) < 0.6
+    pixel = np.where(visible[..., None], draw.uniform(0.0, 640.0, (*shape, 2)), np.nan)
+    turn = draw.normal(size=4)
+    camera = Camera(
+        BIG + np.arange(9) * 100_000_007,
+        pixel,
+        visible,
+        ("a", 'b, "c"', "0", "Ω", "e f"),
+        draw.normal(size=(5, 3)),
+        np.array([458.654, 457.296]),
+        np.array([367.215, 248.375]),
+        np.array([-0.28340811, -0.0]),
+        draw.normal(size=3),
+        turn / np.linalg.norm(turn),
+        np.where(draw.random(shape) < 0.5, 0.3, np.nan),
+        latency_ns=7,
+    )
+    return run.replace(optical=None, camera=camera)
+
+
+RUNS = [pose_run, marker_run, camera_run, bare_run]
 
 
 def assert_same(one, other, *, hidden=True):
@@ -279,7 +303,7 @@ WRONG = {
     "complex": (changed(imu__gyroscope=np.zeros((50, 3), complex)), "complex128", "float64"),
     "flags": (changed(optical__valid=FLAGS + 1), "optical/valid[0]", "0 or 1"),
     "large": (changed(imu__gyroscope=np.full((50, 3), 2**60)), "gyroscope[0, 0]", "2^53"),
-    "nothing": ({"photos/first": FLAGS}, "no stream", "optical, markers, imu, encoder"),
+    "nothing": ({"photos/first": FLAGS}, "no stream", "optical, markers, camera, imu, encoder"),
     "twice": (changed(optical__time_ns=np.r_[TIMES[:1], TIMES[:-1]]), "twice with other numbers"),
     "backwards": (changed(imu__time_ns=np.roll(arrays()["imu/time_ns"], 1)), "imu/time[1]"),
     "all lost": (changed(optical__valid=~FLAGS), "no usable row", "20 hidden", "run.", ":optical"),

@@ -11,7 +11,7 @@ import scenario
 
 import jaxekf
 from jaxekf import estimation as host
-from jaxekf import metrics, padding, simulate, simulate_tool
+from jaxekf import metrics, padding, simulate, simulate_camera, simulate_tool
 from jaxekf.datasets import demo
 from jaxekf.errors import FilterError, ModelError, PrecisionError
 from jaxekf.models import REGISTRY
@@ -85,7 +85,8 @@ def test_buckets_waste_little(count):
 
 
 @pytest.mark.parametrize(
-    "name", scenario.long_form(list(REGISTRY), {"loose_pose", "loose_additive", "marg"})
+    "name",
+    scenario.long_form(list(REGISTRY), {"loose_pose", "loose_additive", "marg", "visual_bilinear"}),
 )
 def test_account_is_exact(name):
     """Would catch rows that vanish: read = used + masked + gated + dropped."""
@@ -98,12 +99,22 @@ def test_account_is_exact(name):
         grade = simulate.SensorGrade(accelerometer=2e-3, magnetometer=0.01)
         r = record(3, grade=grade)
         r.imu.magnetometer[::4] = np.nan
+    if name.startswith("visual"):
+        grade = simulate_camera.CameraGrade(points=8, mismatched=0.1)
+        r = simulate_camera.camera_recording(
+            "run", seed=3, duration_s=3.0, grade=grade, blind=((1.0, 1.5),)
+        )
     later = r.imu.time_ns + 20_000_000
     r = r.replace(imu=replace(r.imu, time_ns=later))
     made = jaxekf.estimate(r, name)
     for stream, count in made.account.items():
         assert count["read"] == sum(v for k, v in count.items() if k != "read"), (stream, count)
     if name in ("triad", "marg"):
+        return
+    if name.startswith("visual"):
+        # The image at the start comes before the IMU's first sample.
+        assert made.account["camera"]["dropped_outside_run"] >= 1
+        assert made.account["camera"]["masked"] >= 6
         return
     optical = made.account["marker_2" if name == "tight" else "optical"]
     # The tracker's first two samples come before the gyroscope's first.

@@ -49,7 +49,9 @@ def weighted(found, seed):
 
 @pytest.mark.parametrize(
     "name",
-    scenario.long_form(list(MODELS), {"loose_pose", "loose_rate", "markers", "visual", "triad"}),
+    scenario.long_form(
+        list(MODELS), {"loose_pose", "loose_rate", "markers", "visual", "visual_bilinear", "triad"}
+    ),
 )
 def test_fast_is_naive(name):
     """Structure found that is not there, a block of rows taken wrongly, a cotangent lost: by a fast path
@@ -82,7 +84,7 @@ def test_fast_is_naive(name):
 
 def test_the_data_gate_and_hide():
     """A comparison that never meets a hidden row, a gated one, or a slow sensor."""
-    steps = hidden_at_random(data(toy_models.VISUAL, 1).epochs, 1)
+    steps = hidden_at_random(data(MODELS["visual"], 1).epochs, 1)
     assert steps.slow
     assert not all(rows.mask.all() for rows in (steps.fast | steps.slow).values())
 

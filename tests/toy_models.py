@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxekf import interpolation, manifold, rotation
 from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Belief, Input, Model, Parameters, Sensor
+from jaxekf.model import Belief, Input, Model, Parameters, Sensor, repeated
 from jaxekf.timeline import Knots, Rows, Steps
 
 
@@ -188,12 +188,13 @@ def _project(x, params, landmark):
     return params.calibration.focal_length * seen[:2] / seen[2]
 
 
-def _visual_camera(x, u, params, aux):
-    return jnp.concatenate([_project(x, params, aux.position[i]) for i in range(4)])
-
-
-def _camera_noise(params, aux, dt):
-    return jnp.diag(jnp.repeat(params.noise.camera_scale * aux.sigma, 2) ** 2)
+POINT = Sensor(
+    "camera",
+    Euclidean(2),
+    lambda x, u, params, aux: _project(x, params, aux.position),
+    lambda params, aux, dt: (params.noise.camera_scale * aux.sigma) ** 2 * jnp.eye(2),
+    gate=0.99,
+)
 
 
 VISUAL = Model(
@@ -217,14 +218,7 @@ VISUAL = Model(
             lambda x, u, params, aux: x.rate + x.gyroscope_bias,
             lambda params, aux, dt: _diagonal(params.noise.gyroscope),
         ),
-        Sensor(
-            "camera",
-            Euclidean(8),
-            _visual_camera,
-            _camera_noise,
-            groups=(0, 0, 1, 1, 2, 2, 3, 3),
-            gate=0.99,
-        ),
+        repeated(POINT, 4),
     ),
     parameters=Parameters(
         VisualNoise(2.0, 1.0, 0.001, 0.002, 0.05, 0.01, 1.0),

@@ -23,7 +23,8 @@ from jaxekf.cli.tune import tune
 def main() -> None:
     """Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
 
-    A run is a folder with recording.toml, optical.csv or markers.csv, imu.csv and, for truth, encoder.csv.
+    A run is a folder with recording.toml, optical.csv or markers.csv, imu.csv and, for truth, encoder.csv;
+    or with camera.csv and landmarks.csv.
     """
     jax.config.update("jax_enable_x64", True)
     prepare()

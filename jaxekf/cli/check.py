@@ -121,6 +121,8 @@ def _document(one: Checked) -> dict[str, Any]:
     if found.markers:
         singles = {name: told.as_dict() for name, told in found.markers.items()}
         streams["markers"]["each"] = singles
+    if found.points is not None:
+        streams["camera"] |= found.points._asdict()
     aligned = None if found.alignment is None else run_document(found.alignment)
     return document | {
         "run": found.run,
@@ -155,7 +157,7 @@ def _tell(one: Checked, *, tables: bool) -> None:
             rows.append(aligned_row(made.run, "encoder", made.encoder))
         columns = alignment_columns()[1:]
         print_table("Against the IMU, with standard deviations", columns, [r[1:] for r in rows])
-    for text in _evidence(found.evidence):
+    for text in (*_points(found), *_evidence(found.evidence)):
         click.echo(f"  {text}")
     for kind, texts in (("note", found.notes), ("warning", found.warnings)):
         for text in texts:
@@ -177,6 +179,17 @@ def _row(label: str, told: StreamFound) -> list[Any]:
         told.gaps.lost_s,
         told.hidden.lost_s,
         sum(told.dropped.values()),
+    ]
+
+
+def _points(found: Inspection) -> list[str]:
+    """How much a camera saw."""
+    made = found.points
+    if made is None:
+        return []
+    return [
+        f"camera: {made.points_per_image:.1f} of {made.landmarks} landmarks in an image on average,"
+        f" {made.images_without_points} of {made.images} images without any"
     ]
 
 

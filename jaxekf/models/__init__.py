@@ -7,7 +7,16 @@ from collections.abc import Sequence
 
 from jaxekf.errors import ModelError
 from jaxekf.model import Model
-from jaxekf.models import loose, loose_additive, loose_pose, loose_rate, marg, tight, triad
+from jaxekf.models import (
+    loose,
+    loose_additive,
+    loose_pose,
+    loose_rate,
+    marg,
+    tight,
+    triad,
+    visual,
+)
 from jaxekf.recording import Recording
 
 REGISTRY: dict[str, Model] = {
@@ -20,6 +29,8 @@ REGISTRY: dict[str, Model] = {
         tight.MODEL,
         triad.MODEL,
         marg.MODEL,
+        visual.MODEL,
+        visual.BILINEAR,
     )
 }
 

@@ -82,7 +82,12 @@ def _lanes(
                 lost = {"hidden, or of too little quality": ~stream.usable[:, i]}
                 lanes[f"marker {name}"] = (told, time_ns, lost)
             continue
-        masked = _masked(recording, label, stream)
+        if label == "camera":
+            # Many landmarks in few images: their rows are no samples, and a lane for each too many.
+            empty = ~stream.usable.any(axis=1)
+            masked = {"no landmark found": empty} if empty.any() else {}
+        else:
+            masked = _masked(recording, label, stream)
         lanes[label] = (found.streams[label], time_ns, masked)
     return lanes
 

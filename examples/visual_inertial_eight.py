@@ -1,0 +1,192 @@
+"""A camera and an IMU that draw an eight before a scene (Hol 2008): fused, and by images alone.
+
+    python examples/visual_inertial_eight.py [--seeds 20] [--figure eight.png]
+
+At 25, 12.5, 6 and 3 images a second the errors of the fused estimate stand beside those of the pose of each
+image by itself (PnP), at the images; then how far the estimate drifts in two seconds without images. The
+last line is JSON; the exit status is 1 where images alone are better at some rate.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import track  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+import jaxekf  # noqa: E402
+from jaxekf import resection  # noqa: E402
+from jaxekf.plots import style  # noqa: E402
+from jaxekf.recording import Floats, Recording, Times, to_scipy  # noqa: E402
+from jaxekf.simulate_camera import CameraGrade, camera_recording  # noqa: E402
+from jaxekf.truth import encoder_at  # noqa: E402
+
+RATES_HZ = (25.0, 12.5, 6.0, 3.0)
+SECONDS, SETTLED_S = 10.8, 2.0
+BLIND = (6.0, 8.0)
+DRIFT_S = (0.5, 1.0, 1.5, 2.0)
+CONSOLE = Console(stderr=True)
+
+
+class Errors(NamedTuple):
+    """Squared errors at some instants."""
+
+    position: Floats
+    """(N,) m^2."""
+    attitude: Floats
+    """(N,) rad^2."""
+
+
+def errors(time_ns: Times, position: Floats, q: Floats, run: Recording) -> Errors:
+    """Squared errors of poses at these instants."""
+    at = encoder_at(run.need_encoder(), time_ns)
+    assert at.position is not None
+    turn = to_scipy(at.q_ref_body).inv() * to_scipy(q)
+    return Errors(np.sum((position - at.position) ** 2, axis=1), turn.magnitude() ** 2)
+
+
+def joined(found: list[Errors]) -> Errors:
+    """Those of all runs."""
+    return Errors(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def rms(found: Errors) -> tuple[float, float]:
+    """Root mean squares, mm and deg."""
+    position, attitude = (float(np.sqrt(np.mean(part))) for part in found)
+    return 1e3 * position, float(np.rad2deg(attitude))
+
+
+def runs_at(rate_hz: float, seeds: int, **changes: Any) -> list[Recording]:
+    """A run of each seed."""
+    grade = CameraGrade(camera_hz=rate_hz)
+    return [
+        camera_recording(f"eight-{seed}", seed=seed, duration_s=SECONDS, grade=grade, **changes)
+        for seed in range(seeds)
+    ]
+
+
+def compared(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], list[Any]]:
+    """Errors of both at the images after `SETTLED_S`; and the estimates."""
+    made = jaxekf.estimate_many(runs, "visual")
+    fused, alone = [], []
+    for run, one in zip(runs, made, strict=True):
+        camera = run.need_camera()
+        raw = resection.poses(camera)
+        settled = camera.time_ns >= camera.time_ns[0] + int(SETTLED_S * 1e9)
+        chosen = raw.valid & settled & (camera.time_ns <= one.time_ns[-1])
+        at = camera.time_ns[chosen]
+        alone.append(errors(at, raw.position[chosen], raw.q_ref_body[chosen], run))
+        here = np.searchsorted(one.time_ns, at)
+        position, q = one.outputs["position"].value[here], one.attitude.value[here]
+        fused.append(errors(at, position, q, run))
+    return {"fused": rms(joined(fused)), "images alone": rms(joined(alone))}, made
+
+
+def drift(seeds: int) -> tuple[dict[str, tuple[float, float]], list[Recording], list[Any]]:
+    """Errors so many seconds after the last image."""
+    runs = runs_at(12.5, seeds, blind=(BLIND,))
+    made = jaxekf.estimate_many(runs, "visual")
+    found = {}
+    for after in DRIFT_S:
+        each = []
+        for run, one in zip(runs, made, strict=True):
+            camera = run.need_camera()
+            last = camera.time_ns[camera.usable.any(axis=1)]
+            last = last[last < last[0] + int(BLIND[0] * 1e9)][-1]
+            here = [int(np.searchsorted(one.time_ns, last + int(after * 1e9)))]
+            position, q = one.outputs["position"].value[here], one.attitude.value[here]
+            each.append(errors(one.time_ns[here], position, q, run))
+        found[f"{after:g}"] = rms(joined(each))
+    return found, runs, made
+
+
+def figure(run: Recording, one: Any) -> Any:
+    """The eight as it was, by images alone, and as estimated; and the height over time with its band."""
+    drawn, axes = style.new_grid(1, 2, (11.0, 4.2))
+    path, over = axes[0]
+    at = encoder_at(run.need_encoder(), one.time_ns)
+    raw = resection.poses(run.need_camera())
+    place, sigma = one.outputs["position"].value, one.outputs["position"].sigma
+    assert at.position is not None
+    path.plot(
+        raw.position[raw.valid, 1], raw.position[raw.valid, 0], ".", color=style.MEASURED, ms=4
+    )
+    path.plot(at.position[:, 1], at.position[:, 0], color=style.TRUTH, lw=1.0)
+    path.plot(place[:, 1], place[:, 0], color=style.ESTIMATE, lw=1.0)
+    path.set(xlabel="y (m)", ylabel="x, up (m)", title="the eight", aspect="equal")
+    seconds = (run.need_camera().time_ns - one.time_ns[0]) / 1e9
+    truth = at.position[:, 0]
+    style.band(over, one.time, 1e3 * (place[:, 0] - truth), 1e3 * sigma[:, 0], "2 sigma")
+    over.plot(one.time, 1e3 * (place[:, 0] - truth), color=style.ESTIMATE, lw=1.0, label="fused")
+    here = np.clip(np.searchsorted(one.time_ns, run.need_camera().time_ns), 0, len(truth) - 1)
+    off = 1e3 * (raw.position[:, 0] - truth[here])
+    over.plot(
+        seconds[raw.valid], off[raw.valid], ".", color=style.MEASURED, ms=4, label="images alone"
+    )
+    over.plot([], [], color=style.TRUTH, lw=1.0, label="truth")
+    begin, end = BLIND
+    over.axvspan(begin, end, color=style.HIDDEN, alpha=0.6, lw=0, label="no images")
+    over.set(
+        xlabel="time (s)", ylabel="error of x, up (mm)", title="with two seconds without images"
+    )
+    over.set_ylim(-150.0, 150.0)
+    over.legend(ncols=2, fontsize=8)
+    return drawn
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--figure", type=Path, default=Path("eight.png"))
+    return parser.parse_args()
+
+
+def main() -> None:
+    arguments = parse_arguments()
+    began = time.perf_counter()
+    found = {}
+    for rate in track(RATES_HZ, "image rates", console=CONSOLE, transient=True):
+        found[f"{rate:g}"] = compared(runs_at(rate, arguments.seeds))[0]
+    drifted, runs, made = drift(arguments.seeds)
+    style.save(figure(runs[0], made[0]), arguments.figure)
+    console = Console()
+    table = Table("images a second", "fused", "images alone", title="RMSE, mm and deg")
+    for rate, both in found.items():
+        table.add_row(rate, *(f"{mm:.1f} mm, {deg:.3f} deg" for mm, deg in both.values()))
+    console.print(table)
+    table = Table("seconds without images", "position", "attitude", title="drift, RMS")
+    for after, (mm, deg) in drifted.items():
+        table.add_row(after, f"{mm:.1f} mm", f"{deg:.3f} deg")
+    console.print(table)
+    better = all(
+        fused < alone
+        for both in found.values()
+        for fused, alone in zip(both["fused"], both["images alone"], strict=True)
+    )
+    print(
+        json.dumps(
+            {
+                "seeds": arguments.seeds,
+                "rmse_mm_deg": found,
+                "drift_mm_deg": drifted,
+                "fused_is_better": better,
+                "seconds": round(time.perf_counter() - began, 1),
+            }
+        )
+    )
+    sys.exit(0 if better else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,507 @@
+"""`visual`: pose from landmarks in images and an IMU, both of them measurements.
+
+The filter of Hol (2008): 22 numbers, 21 degrees of freedom, eqs. 9 (process), 11a (accelerometer), 11b
+(gyroscope) and 3a or 11c (point correspondences). The state carries acceleration and rate, which are
+random walks here with spectral densities; so images and IMU may come at any rates, and either may fail.
+
+A camera's sample has one group of two rows for each of as many landmarks as an image has at most; see
+`jaxekf.model.repeated`. The measurement is the image point itself (reprojection). `visual_bilinear` has
+the thesis' 11c: ``0 = (I, -z) p_camera``, in metres, z the direction of the image point; there the
+point goes into the slope, and its depth into the noise.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf import linalg, pose, projection, resection, rotation
+from jaxekf.errors import RecordingError
+from jaxekf.manifold import SO3, Euclidean
+from jaxekf.model import Model, Output, Parameters, Sensor, Start, repeated
+from jaxekf.models import inertial, sources
+from jaxekf.projection import Lens
+from jaxekf.recording import (
+    NANOSECONDS,
+    Camera,
+    Flags,
+    Floats,
+    Recording,
+    Samples,
+    Times,
+    to_scipy,
+)
+
+GATE = 0.999
+_FEWEST = 8
+"""Groups of an image that a model has at least; it has a multiple of them, so that few are compiled."""
+_LINE_S = 0.35
+_NEAR_S = 0.1
+"""An IMU sample so near to the first image tells acceleration and rate there."""
+
+
+class State(NamedTuple):
+    """The body (the IMU) in the scene."""
+
+    position: Any
+    velocity: Any
+    acceleration: Any
+    q_ref_body: Any
+    rate: Any
+    """Body frame."""
+    bias: Any
+    """Of the gyroscope."""
+    accelerometer_bias: Any
+
+
+class Noise(NamedTuple):
+    """What is random: leaves of shape (), (3,) or (3, 3), but for `pixel`, ()."""
+
+    jerk: Any
+    """Random walk of the acceleration, reference frame."""
+    angular_acceleration: Any
+    """Random walk of the rate, body frame."""
+    bias_walk: Any
+    accelerometer_walk: Any
+    gyroscope: Any
+    accelerometer: Any
+    pixel: Any
+    """Standard deviation of an image point in each direction; a reported one adds to it."""
+
+
+class Calibration(NamedTuple):
+    """Corrections of what a recording states of its camera."""
+
+    lever_arm: Any
+    """Metres from where the camera is said to be in the body to where it is, body frame; (3,)."""
+    alignment: Any
+    """Rotation vector from the camera's frame as it is said to be to what it is, camera frame; (3,)."""
+    focal: Any
+    """Factors of the focal lengths; (2,)."""
+    centre: Any
+    """Pixels to add to the image point of the axis; (2,)."""
+    radial: Any
+    """To add to the radial distortion; (2,)."""
+    latency: Any
+    """Seconds that images are older than they are said to be; ()."""
+
+
+class Initial(NamedTuple):
+    """Standard deviations of the belief a run starts from."""
+
+    position: Any
+    """About the pose of the first image, which is then used as a measurement: keep it and the attitude
+    wide, but not so wide that mismatches fit."""
+    velocity: Any
+    acceleration: Any
+    attitude: Any
+    rate: Any
+    bias: Any
+    accelerometer_bias: Any
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run."""
+
+    gravity_ref: Any
+    """(3,) free fall in the scene, m/s^2."""
+    focal: Any
+    centre: Any
+    radial: Any
+    p_body_camera: Any
+    """(3,) metres."""
+    q_body_camera: Any
+    """(4,)"""
+
+
+class Point(NamedTuple):
+    """Of one correspondence: its landmark, and how well the image point is known."""
+
+    p_ref_landmark: Any
+    """(3,) metres."""
+    sigma: Any
+    """Reported standard deviation, pixels; 0 where none was reported; ()."""
+
+
+class SeenPoint(NamedTuple):
+    """The same where the image point goes into the slope."""
+
+    p_ref_landmark: Any
+    sigma: Any
+    pixel: Any
+    """(2,) the image point."""
+    depth: Any
+    """Metres along the optical axis, from the pose of the image alone; ()."""
+
+
+SPACE: Any = State(
+    Euclidean(3, "m", frame="reference"),
+    Euclidean(3, "m/s", frame="reference"),
+    Euclidean(3, "m/s^2", frame="reference"),
+    SO3(),
+    Euclidean(3, "rad/s"),
+    Euclidean(3, "rad/s"),
+    Euclidean(3, "m/s^2"),
+)
+
+
+def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
+    """Eqs. 9: position, velocity and attitude carried on, all else a random walk.
+
+    ``w`` holds the changes of acceleration, rate and both biases. What they add to position, velocity and
+    attitude on the way is that of a change at a constant speed.
+    """
+    jump, swing = w[:3], w[3:6]
+    return State(
+        x.position + (x.velocity + (x.acceleration / 2.0 + jump / 6.0) * dt) * dt,
+        x.velocity + (x.acceleration + jump / 2.0) * dt,
+        x.acceleration + jump,
+        SO3().retract(x.q_ref_body, (x.rate + swing / 2.0) * dt),
+        x.rate + swing,
+        x.bias + w[6:9],
+        x.accelerometer_bias + w[9:],
+    )
+
+
+def process_noise(params: Parameters, dt: Array) -> Array:
+    """Covariance (12, 12) of the changes of acceleration, rate, and both biases over ``dt``."""
+    noise = params.noise
+    densities = (
+        noise.jerk,
+        noise.angular_acceleration,
+        noise.bias_walk,
+        noise.accelerometer_walk,
+    )
+    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
+
+
+def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
+    """Eq. 11b."""
+    return x.rate + x.bias
+
+
+def predict_accelerometer(x: State, u: Any, params: Parameters, aux: Any) -> Array:
+    """Eq. 11a: what acceleration and gravity are in the body."""
+    force = x.acceleration - params.setup.gravity_ref
+    return rotation.rotate_inverse(x.q_ref_body, force) + x.accelerometer_bias
+
+
+def lens_of(params: Parameters) -> Lens:
+    """The camera's lens as stated and corrected."""
+    setup, more = params.setup, params.calibration
+    return Lens(setup.focal * more.focal, setup.centre + more.centre, setup.radial + more.radial)
+
+
+def in_camera(x: State, params: Parameters, p_ref_landmark: Array) -> Array:
+    """Eq. 3b: a landmark (3,) in the camera's frame, metres, when the image was taken."""
+    setup, more = params.setup, params.calibration
+    back = -more.latency
+    position = x.position + (x.velocity + 0.5 * x.acceleration * back) * back
+    attitude = SO3().retract(x.q_ref_body, x.rate * back)
+    in_body = rotation.rotate_inverse(attitude, p_ref_landmark - position)
+    turn = rotation.product(setup.q_body_camera, rotation.exp(more.alignment))
+    return rotation.rotate_inverse(turn, in_body - setup.p_body_camera - more.lever_arm)
+
+
+def predict_point(x: State, u: Any, params: Parameters, aux: Point) -> Array:
+    """Eq. 3a: the image point (2,) of a landmark, pixels."""
+    return projection.project(lens_of(params), in_camera(x, params, aux.p_ref_landmark))
+
+
+def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
+    """Covariance (2, 2), pixels squared."""
+    return (params.noise.pixel**2 + aux.sigma**2) * jnp.eye(2)
+
+
+def predict_bilinear(x: State, u: Any, params: Parameters, aux: SeenPoint) -> Array:
+    """Eq. 11c: how far (2,), metres, the landmark lies off the ray of its image point, beside the axis."""
+    p = in_camera(x, params, aux.p_ref_landmark)
+    return p[:2] - projection.ray(lens_of(params), aux.pixel) * p[2]
+
+
+def bilinear_noise(params: Parameters, aux: SeenPoint, dt: Array) -> Array:
+    """Covariance (2, 2), metres squared: that of the image point at the landmark's depth."""
+    slope = jax.jacfwd(partial(projection.ray, lens_of(params)))(aux.pixel)
+    variance = params.noise.pixel**2 + aux.sigma**2
+    return variance * aux.depth**2 * linalg.multiply_transposed(slope, slope)
+
+
+def _density(name: str, params: Parameters, aux: Any, dt: Array) -> Array:
+    return linalg.covariance(getattr(params.noise, name), 3) / dt
+
+
+def accelerometer(recording: Recording) -> Samples:
+    """The accelerometer's specific force (N, 3), m/s^2, body frame."""
+    both = sources.imu(recording)
+    return Samples(both.time_ns, both.value[:, 3:], both.mask, origin=both.origin)
+
+
+def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
+    """The image points (N, 2 count) of up to `count` landmarks of each image, the first of them in the
+    order of the landmarks; of the bilinear form zeros."""
+    stream = recording.need_camera()
+    usable = stream.usable
+    # The landmarks that are seen, in order, then others to fill up.
+    order = np.argsort(~usable, axis=1, kind="stable")[:, :count]
+    here = np.arange(len(stream.time_ns))[:, None]
+    mask = usable[here, order]
+    pixel = np.where(mask[..., None], stream.pixel[here, order], 0.0)
+    short = count - order.shape[1]
+    sigma = np.zeros(mask.shape)
+    if stream.sigma is not None:
+        sigma = np.nan_to_num(np.where(mask, stream.sigma[here, order], 0.0))
+    place = stream.p_ref_landmark[order]
+    place, sigma, value = (_filled(a, short) for a in (place, sigma, pixel))
+    aux: Any = Point(place, sigma)
+    if bilinear:
+        aux = SeenPoint(place, sigma, value, _depth(stream, place, recording))
+        value = np.zeros_like(value)
+    rows = np.repeat(_filled(mask, short), 2, axis=1)
+    taken = stream.time_ns - stream.latency_ns
+    flat = value.reshape(len(value), -1)
+    there = stream.visible.sum(axis=1)
+    known = (stream.latency_ns, ("camera",))
+    return Samples(taken, flat, rows, aux, *known, points=there, copies=count)
+
+
+def _filled(values: Any, short: int) -> Any:
+    """So many more groups (axis 1), copies of the first."""
+    return np.concatenate([values, np.repeat(values[:, :1], short, axis=1)], axis=1)
+
+
+def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
+    """Depths (N, M), metres, of landmarks (N, M, 3) from the poses of the images alone, those of the
+    nearest image that has one."""
+    found = resection.poses(stream)
+    known = np.flatnonzero(found.valid)
+    if known.size == 0:
+        raise RecordingError(
+            recording.path or recording.name,
+            "no image from which a pose follows",
+            "one, whose depths the bilinear form needs",
+            "the model visual, or a run with six landmarks in an image",
+        )
+    at = known[np.argmin(np.abs(np.arange(len(found.valid))[:, None] - known[None]), axis=1)]
+    away = place - found.position[at][:, None]
+    inside = np.stack(
+        [to_scipy(found.q_ref_body[at]).inv().apply(away[:, i]) for i in range(away.shape[1])],
+        axis=1,
+    )
+    forward = to_scipy(stream.q_body_camera).inv()
+    flat = (inside - stream.p_body_camera).reshape(-1, 3)
+    return np.maximum(forward.apply(flat)[:, 2].reshape(place.shape[:2]), projection.NEAREST)
+
+
+def setup(recording: Recording) -> Setup:
+    """The camera as stated, and gravity: stated, or found from images and accelerometer."""
+    stream, info = recording.need_camera(), recording.info
+    stated = info.get("gravity_ref")
+    if stated is None:
+        raw = resection.as_optical(stream)
+        stated = pose.gravity(raw, recording.need_imu(), recording.path or recording.name)
+    turn = np.asarray(stream.q_body_camera, float)
+    return Setup(
+        np.asarray(stated, float),
+        np.asarray(stream.focal, float),
+        np.asarray(stream.centre, float),
+        np.asarray(stream.radial, float),
+        np.asarray(stream.p_body_camera, float),
+        turn / np.linalg.norm(turn),
+    )
+
+
+def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
+    """The first image from which a pose follows, with the IMU beside it."""
+    stream, imu = recording.need_camera(), recording.need_imu()
+    raw = resection.as_optical(stream)
+    taken = raw.time_ns - raw.latency_ns
+    valid = raw.valid & np.isin(taken, samples["camera"].time_ns)
+    valid &= (taken >= imu.time_ns[0]) & (taken <= imu.time_ns[-1])
+    if not valid.any() or raw.position is None:
+        return None
+    first = int(np.argmax(valid))
+    known: dict[str, Any] = {
+        "position": raw.position[first],
+        "q_ref_body": raw.q_ref_body[first],
+        "velocity": _velocity(taken, raw.position, valid, first),
+    }
+    near = int(np.argmin(np.abs(imu.time_ns - taken[first])))
+    if abs(int(imu.time_ns[near] - taken[first])) <= _NEAR_S * NANOSECONDS:
+        known["rate"] = imu.gyroscope[near]
+        if imu.accelerometer is not None:
+            force = to_scipy(raw.q_ref_body[first]).apply(imu.accelerometer[near])
+            known["acceleration"] = force + setup(recording).gravity_ref
+    waited = (taken[first] - taken[0]) / NANOSECONDS
+    note = ""
+    if waited > 0.0:
+        note = f"waited {waited:.3f} s for an image from which a pose follows, to start from"
+    return Start(int(taken[first]), known, note)
+
+
+def _velocity(taken: Times, position: Floats, valid: Flags, first: int) -> Floats:
+    """Velocity (3,), m/s, at an image: slope of a line through the positions of the third of a second from
+    there, since those of single images are too uncertain for a difference; 0 where there is one only."""
+    t = (taken - taken[first]) / NANOSECONDS
+    near = valid & (t >= 0.0) & (t <= _LINE_S)
+    if near.sum() < 2:
+        return np.zeros(3)
+    return np.polynomial.polynomial.polyfit(t[near], position[near], 1)[1]
+
+
+def initial_mean(first: Mapping[str, Any]) -> State:
+    """What was found at the start (at the origin, at rest, where it was not), no biases."""
+    zero = jnp.zeros(3)
+    return State(
+        jnp.asarray(first.get("position", zero)),
+        jnp.asarray(first.get("velocity", zero)),
+        jnp.asarray(first.get("acceleration", zero)),
+        jnp.asarray(first.get("q_ref_body", rotation.identity())),
+        jnp.asarray(first.get("rate", zero)),
+        zero,
+        zero,
+    )
+
+
+def adapt(bilinear: bool, recordings: Sequence[Recording]) -> Model:
+    """The model for as many landmarks as an image of these recordings has at most."""
+    most = max((int(r.need_camera().usable.sum(axis=1).max()) for r in recordings), default=1)
+    return for_points(-(-max(most, 1) // _FEWEST) * _FEWEST, bilinear)
+
+
+@lru_cache(maxsize=32)
+def for_points(count: int, bilinear: bool = False) -> Model:
+    """The model for images of up to `count` landmarks; the same object for the same numbers."""
+    return _build(count, bilinear)
+
+
+DEFAULTS = Parameters(
+    Noise(
+        jerk=3.0,
+        angular_acceleration=1.0,
+        bias_walk=np.deg2rad(0.002),
+        accelerometer_walk=1e-3,
+        gyroscope=np.deg2rad(0.05),
+        accelerometer=2e-2,
+        pixel=0.7,
+    ),
+    Calibration(
+        lever_arm=np.zeros(3),
+        alignment=np.zeros(3),
+        focal=np.ones(2),
+        centre=np.zeros(2),
+        radial=np.zeros(2),
+        latency=np.array(0.0),
+    ),
+    Initial(
+        position=0.05,
+        velocity=1.0,
+        acceleration=1.0,
+        attitude=np.deg2rad(1.0),
+        rate=0.2,
+        bias=np.deg2rad(1.0),
+        accelerometer_bias=0.2,
+    ),
+    Setup(
+        np.array(inertial.STANDARD_GRAVITY),
+        np.array([213.0, 213.0]),
+        np.array([160.0, 120.0]),
+        np.zeros(2),
+        np.zeros(3),
+        np.array([1.0, 0.0, 0.0, 0.0]),
+    ),
+)
+
+UNITS = Parameters(
+    Noise(
+        "m/s^3/sqrt(Hz)",
+        "rad/s^2/sqrt(Hz)",
+        "rad/s^2/sqrt(Hz)",
+        "m/s^3/sqrt(Hz)",
+        "rad/s/sqrt(Hz)",
+        "m/s^2/sqrt(Hz)",
+        "px",
+    ),
+    Calibration("m", "rad", "1", "px", "1", "s"),
+    Initial("m", "m/s", "m/s^2", "rad", "rad/s", "rad/s", "m/s^2"),
+)
+
+OUTPUTS = (
+    Output(
+        "position",
+        Euclidean(3, "m", frame="reference"),
+        "reference",
+        lambda x, u, params: x.position,
+    ),
+    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
+    Output(
+        "velocity",
+        Euclidean(3, "m/s", frame="reference"),
+        "reference",
+        lambda x, u, params: x.velocity,
+    ),
+    Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+)
+
+
+def _point(count: int, bilinear: bool) -> Sensor:
+    """One correspondence."""
+    place = np.array([0.0, 0.0, 2.0])
+    like: Any = Point(place, 0.0)
+    if bilinear:
+        like = SeenPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
+    return Sensor(
+        "camera",
+        Euclidean(2, "m" if bilinear else "px"),
+        predict_bilinear if bilinear else predict_point,
+        bilinear_noise if bilinear else point_noise,
+        partial(camera, count, bilinear),
+        gate=GATE,
+        aux_like=like,
+    )
+
+
+def _build(count: int, bilinear: bool) -> Model:
+    labels = [f"{axis}{i}" for i in range(count) for axis in "uv"]
+    return Model(
+        name="visual_bilinear" if bilinear else "visual",
+        summary="pose, velocity and IMU biases from landmarks in images and an IMU"
+        + (", correspondences as published" if bilinear else ""),
+        space=SPACE,
+        transition=transition,
+        process_noise=process_noise,
+        sensors=(
+            Sensor(
+                "accelerometer",
+                Euclidean(3, "m/s^2"),
+                predict_accelerometer,
+                partial(_density, "accelerometer"),
+                accelerometer,
+            ),
+            Sensor(
+                "gyroscope",
+                Euclidean(3, "rad/s"),
+                predict_gyroscope,
+                partial(_density, "gyroscope"),
+                sources.gyroscope,
+            ),
+            repeated(_point(count, bilinear), count, labels),
+        ),
+        parameters=DEFAULTS,
+        units=UNITS,
+        noise_dims=Noise(3, 3, 3, 3, 3, 3, 1),
+        initial_mean=initial_mean,
+        initial_covariance=inertial.initial_covariance,
+        find_start=find_start,
+        adapt=partial(adapt, bilinear),
+        setup=setup,
+        outputs=OUTPUTS,
+    )
+
+
+MODEL = for_points(_FEWEST)
+"""For eight landmarks in an image; `adapt` makes the one that a recording needs."""
+BILINEAR = for_points(_FEWEST, True)

@@ -1,0 +1,266 @@
+"""Pose of a camera from landmarks in one image, image by image, without any filter (PnP), on the host.
+
+Directions are solved for linearly first (DLT; of landmarks in one plane a homography), from all points, and
+where that does not fit from random small subsets, so that mismatches do not decide; the start whose median
+error is least is then refined by Gauss and Newton on the manifold, points that are far off counting less.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxekf.projection import NEAREST
+from jaxekf.recording import Camera, Flags, Floats, Optical, from_scipy, to_scipy
+
+_FEWEST, _FEWEST_FLAT = 6, 4
+_SUBSETS = 24
+_ITERATIONS = 12
+_GOOD_START = 0.01
+"""Median error, in focal lengths, from which Gauss and Newton arrive."""
+_FLAT = 1e-3
+"""Landmarks are in one plane where they are this much thinner than wide."""
+_CUTOFF = 4.685
+"""Of Tukey's weight, in robust standard deviations: 95 % as good as least squares without mismatches."""
+_MAD = 1.4826
+_LARGEST_ERROR = 0.05
+"""Of the points that count, in focal lengths: a fit that is worse is none."""
+_LEAST_SHARE = 0.5
+"""Of the points must count."""
+
+
+class Resection(NamedTuple):
+    """Poses of the body, image by image."""
+
+    q_ref_body: Floats
+    """(N, 4)."""
+    position: Floats
+    """(N, 3) metres: the body's origin in the reference frame."""
+    cov: Floats
+    """(N, 6, 6) covariance of position (reference frame) and attitude (body frame), for noise of the size
+    of `error`."""
+    error: Floats
+    """(N,) pixels: robust standard deviation of the points about their landmarks."""
+    valid: Flags
+    """(N,) False where too few landmarks are seen, or no pose fits; the rest is then the identity."""
+    fits: Flags
+    """(N, L) points that fit the pose."""
+
+
+def poses(camera: Camera) -> Resection:
+    """The pose of every image from at least six landmarks, or four that lie in one plane."""
+    usable = camera.usable
+    count = len(usable)
+    direction = _directions(camera)
+    turn, away = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    valid = np.zeros(count, bool)
+    rng = np.random.default_rng(0)
+    for i in np.flatnonzero(usable.sum(axis=1) >= _FEWEST_FLAT):
+        seen = np.flatnonzero(usable[i])
+        found = _start(direction[i, seen], camera.p_ref_landmark[seen], rng)
+        if found is not None:
+            turn[i], away[i], valid[i] = *found, True
+    weight = np.where(usable & valid[:, None], 1.0, 0.0)
+    scale = np.ones(count)
+    for _ in range(_ITERATIONS):
+        residual, slope = _linearised(camera, turn, away)
+        scale = _scale(residual, usable)
+        weight = _weights(residual, scale, usable & valid[:, None])
+        step, _ = _solved(residual, slope, weight)
+        away = away + step[:, :3]
+        turn = turn @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
+    residual, slope = _linearised(camera, turn, away)
+    scale = _scale(residual, usable)
+    weight = _weights(residual, scale, usable & valid[:, None])
+    counted = (weight > 0.0).sum(axis=1)
+    valid &= scale <= _LARGEST_ERROR * float(np.mean(camera.focal))
+    valid &= counted >= np.maximum(_FEWEST_FLAT, _LEAST_SHARE * usable.sum(axis=1))
+    valid &= np.isfinite(away).all(axis=1)
+    _, information = _solved(residual, slope, weight)
+    return _of_body(camera, turn, away, information, scale, valid, weight > 0.0)
+
+
+def as_optical(camera: Camera) -> Optical:
+    """The raw pose of every image, as a tracker would report it."""
+    found = poses(camera)
+    return Optical(
+        camera.time_ns,
+        found.q_ref_body,
+        found.valid,
+        found.position,
+        latency_ns=camera.latency_ns,
+    )
+
+
+def _directions(camera: Camera) -> Floats:
+    """(N, L, 2) where the rays of the points meet the plane at distance 1, the lens undone."""
+    pixel = np.where(camera.usable[..., None], camera.pixel, camera.centre)
+    bent = (pixel - camera.centre) / camera.focal
+    point = bent
+    for _ in range(8):
+        point = bent / _stretch(camera, point)[..., None]
+    return point
+
+
+def _stretch(camera: Camera, point: Floats) -> Floats:
+    r2 = np.sum(point * point, axis=-1)
+    return 1.0 + (camera.radial[0] + camera.radial[1] * r2) * r2
+
+
+# --- the linear start ---------------------------------------------------------------------------------
+
+
+def _start(
+    direction: Floats, place: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats] | None:
+    """The camera's axes in the reference frame (3, 3) and its place (3,), from points (M, 2) of landmarks
+    (M, 3): of all linear solutions the one whose median error is least; None where there is none."""
+    middle = place.mean(axis=0)
+    thin = np.linalg.svd(place - middle, full_matrices=False)
+    flat = thin[1][2] <= _FLAT * thin[1][0]
+    if thin[1][1] <= _FLAT * thin[1][0] or (not flat and len(place) < _FEWEST):
+        return None
+    size, solve = (_FEWEST_FLAT, _homography) if flat else (_FEWEST, _linear)
+    best, least = None, np.inf
+    for number in range(1 + _SUBSETS if len(place) > size else 1):
+        subset = rng.permutation(len(place))[:size] if number else np.arange(len(place))
+        found = solve(direction[subset], place[subset], thin[2])
+        if found is None:
+            continue
+        inside = (place - found[1]) @ found[0]
+        depth = np.maximum(inside[:, 2:], NEAREST)
+        off = np.linalg.norm(inside[:, :2] / depth - direction, axis=1)
+        off[inside[:, 2] <= NEAREST] = np.inf
+        if (middling := float(np.median(off))) < least:
+            best, least = found, middling
+        if least < _GOOD_START:
+            break
+    return best
+
+
+def _linear(direction: Floats, place: Floats, _: Floats) -> tuple[Floats, Floats] | None:
+    """By the direct linear transform: the matrix (3, 4) that takes landmarks to their rays."""
+    middle = place.mean(axis=0)
+    size = np.sqrt(np.mean((place - middle) ** 2)) + 1e-12
+    scaled = np.concatenate([(place - middle) / size, np.ones((len(place), 1))], axis=1)
+    zero = np.zeros_like(scaled)
+    first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
+    second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
+    matrix = _null(np.concatenate([first, second])).reshape(3, 4)
+    matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
+    if np.linalg.det(matrix[:, :3]) <= 0.0:
+        return None
+    u, s, vt = np.linalg.svd(matrix[:, :3])
+    towards = u @ vt
+    return towards.T, middle - size * towards.T @ matrix[:, 3] / s.mean()
+
+
+def _homography(direction: Floats, place: Floats, axes: Floats) -> tuple[Floats, Floats] | None:
+    """From landmarks in the plane of the first two of `axes` (rows)."""
+    middle = place.mean(axis=0)
+    inside = (place - middle) @ axes[:2].T
+    size = np.sqrt(np.mean(inside**2)) + 1e-12
+    scaled = np.concatenate([inside / size, np.ones((len(place), 1))], axis=1)
+    zero = np.zeros_like(scaled)
+    first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
+    second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
+    matrix = _null(np.concatenate([first, second])).reshape(3, 3)
+    matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
+    length = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
+    if length <= 1e-12:
+        return None
+    one, two = matrix[:, 0] / length, matrix[:, 1] / length
+    u, _, vt = np.linalg.svd(np.stack([one, two, np.cross(one, two)], axis=1))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    whole = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
+    towards = turn @ whole
+    return towards.T, middle - size * towards.T @ matrix[:, 2] / length
+
+
+def _null(matrix: Floats) -> Floats:
+    """The vector that the matrix makes smallest."""
+    return np.linalg.eigh(matrix.T @ matrix)[1][:, 0]
+
+
+# --- Gauss and Newton ---------------------------------------------------------------------------------
+
+
+def _linearised(camera: Camera, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
+    """Residuals (N, L, 2), pixels, and their derivatives (N, L, 2, 6) by the camera's place in the
+    reference frame and its turn in its own, at its axes (N, 3, 3) and place (N, 3)."""
+    inside = (camera.p_ref_landmark[None] - away[:, None]) @ turn
+    depth = np.maximum(inside[..., 2], NEAREST)
+    point = inside[..., :2] / depth[..., None]
+    r2, stretch = np.sum(point * point, axis=-1), _stretch(camera, point)
+    seen = camera.focal * point * stretch[..., None] + camera.centre
+    pixel = np.where(camera.usable[..., None], camera.pixel, seen)
+    # By the point: of ``point * stretch``; then by the landmark in the camera's frame.
+    bent = 2.0 * (camera.radial[0] + 2.0 * camera.radial[1] * r2)
+    by_point = stretch[..., None, None] * np.eye(2)
+    by_point = by_point + bent[..., None, None] * point[..., :, None] * point[..., None, :]
+    by_point = camera.focal[:, None] * by_point
+    by_inside = np.zeros((*depth.shape, 2, 3))
+    by_inside[..., 0, 0] = by_inside[..., 1, 1] = 1.0 / depth
+    by_inside[..., 2] = -point / depth[..., None]
+    slope = by_point @ by_inside
+    by_place = -slope @ np.swapaxes(turn, 1, 2)[:, None]
+    by_turn = slope @ _cross(inside)
+    return pixel - seen, np.concatenate([by_place, by_turn], axis=-1)
+
+
+def _cross(vector: Floats) -> Floats:
+    """Matrices (..., 3, 3) whose product with another vector is the cross product."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _scale(residual: Floats, usable: Flags) -> Floats:
+    """(N,) robust standard deviation of each coordinate, pixels."""
+    size = np.where(usable[..., None], np.abs(residual), np.nan).reshape(len(residual), -1)
+    empty = ~usable.any(axis=1)
+    size[empty] = 0.0
+    return np.maximum(_MAD * np.nanmedian(size, axis=1), 1e-9)
+
+
+def _weights(residual: Floats, scale: Floats, usable: Flags) -> Floats:
+    """(N, L) Tukey's weights of points by how far they are off."""
+    off = np.linalg.norm(residual, axis=-1) / (_CUTOFF * scale)[:, None]
+    return np.where(usable & (off < 1.0), (1.0 - np.minimum(off, 1.0) ** 2) ** 2, 0.0)
+
+
+def _solved(residual: Floats, slope: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Steps (N, 6) of Gauss and Newton, and the information (N, 6, 6) at unit noise."""
+    information = np.einsum("nl,nlri,nlrj->nij", weight, slope, slope)
+    pull = np.einsum("nl,nlri,nlr->ni", weight, slope, residual)
+    size = np.trace(information, axis1=1, axis2=2)
+    some = np.maximum(size, 1.0)[:, None, None] * 1e-12 * np.eye(6)
+    return np.linalg.solve(information + some, pull[..., None])[..., 0], information + some
+
+
+def _of_body(
+    camera: Camera,
+    turn: Floats,
+    away: Floats,
+    information: Floats,
+    scale: Floats,
+    valid: Flags,
+    fits: Flags,
+) -> Resection:
+    """From the camera's pose to the body's."""
+    mount = to_scipy(camera.q_body_camera)
+    body = Rotation.from_matrix(turn) * mount.inv()
+    position = away - body.apply(camera.p_body_camera)
+    cov = scale[:, None, None] ** 2 * np.linalg.inv(information)
+    # Errors: of the body's place ``d away - d(R) p``, and of its attitude turned into the body.
+    change = np.zeros((len(away), 6, 6))
+    change[:, :3, :3] = np.eye(3)
+    change[:, 3:, 3:] = mount.as_matrix()
+    lever: Any = body.as_matrix() @ _cross(camera.p_body_camera)
+    change[:, :3, 3:] = lever @ mount.as_matrix()
+    cov = change @ cov @ np.swapaxes(change, 1, 2)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    q = np.where(valid[:, None], from_scipy(body), identity)
+    where = np.where(valid[:, None], position, 0.0)
+    return Resection(q, where, cov, scale, valid, fits & valid[:, None])

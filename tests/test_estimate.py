@@ -104,6 +104,7 @@ def test_account_is_exact(name):
         r = simulate_camera.camera_recording(
             "run", seed=3, duration_s=3.0, grade=grade, blind=((1.0, 1.5),)
         )
+        r.camera.pixel[25] = np.nan
     later = r.imu.time_ns + 20_000_000
     r = r.replace(imu=replace(r.imu, time_ns=later))
     made = jaxekf.estimate(r, name)
@@ -114,7 +115,10 @@ def test_account_is_exact(name):
     if name.startswith("visual"):
         # The image at the start comes before the IMU's first sample.
         assert made.account["camera"]["dropped_outside_run"] >= 1
-        assert made.account["camera"]["masked"] >= 6
+        camera, image = made.account["camera"], int(r.camera.visible[25].sum())
+        assert camera["masked"] == image == 8
+        assert camera["read"] == int(r.camera.visible.sum())
+        assert camera["gated"] >= 5
         return
     optical = made.account["marker_2" if name == "tight" else "optical"]
     # The tracker's first two samples come before the gyroscope's first.

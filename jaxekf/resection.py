@@ -60,8 +60,6 @@ def poses(camera: Camera) -> Resection:
         found = _start(direction[i, seen], camera.p_ref_landmark[seen], rng)
         if found is not None:
             turn[i], away[i], valid[i] = *found, True
-    weight = np.where(usable & valid[:, None], 1.0, 0.0)
-    scale = np.ones(count)
     for _ in range(_ITERATIONS):
         residual, slope = _linearised(camera, turn, away)
         scale = _scale(residual, usable)
@@ -151,7 +149,8 @@ def _linear(direction: Floats, place: Floats, _: Floats) -> tuple[Floats, Floats
     if np.linalg.det(matrix[:, :3]) <= 0.0:
         return None
     u, s, vt = np.linalg.svd(matrix[:, :3])
-    towards = u @ vt
+    # A determinant that is 0 but for rounding, as of a subset in one plane, may hide a reflection.
+    towards = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return towards.T, middle - size * towards.T @ matrix[:, 3] / s.mean()
 
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import ekf, linalg, manifold, regions, simulate, simulate_camera, timeline
+from jaxekf import ekf, linalg, manifold, regions, resection, simulate, simulate_camera, timeline
 from jaxekf.model import Belief
 from jaxekf.models import visual
 from jaxekf.parameters import as_arrays
@@ -196,6 +196,19 @@ def test_mismatches_are_gated():
         refused = record.gated.sum() / (record.gated | record.used).sum()
     assert (found[0.1] <= 1.15 * found[0.0]).all()
     assert 0.05 < refused < 0.14
+
+
+def test_images_alone_with_mismatches():
+    """Would catch a reflection from a subset in one plane, which no rotation is, and a pose that mismatches
+    pull."""
+    for seed in range(3):
+        grade = CameraGrade(mismatched=0.1)
+        run = camera_recording("run", seed=seed, duration_s=2.0, grade=grade)
+        found = resection.poses(run.camera)
+        assert found.valid.mean() > 0.9
+        at = encoder_at(run.need_encoder(), run.camera.time_ns)
+        off = np.linalg.norm(found.position - at.position, axis=1)[found.valid & at.valid]
+        assert np.median(off) < 0.05
 
 
 def test_gravity_off_by_a_degree():

@@ -16,7 +16,7 @@ from jaxekf import linalg, pose, rotation
 from jaxekf.interpolation import InputSample
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Output, Parameters
-from jaxekf.recording import Optical, Recording
+from jaxekf.recording import Floats, Optical, Recording
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
@@ -158,15 +158,20 @@ def initial_mean(first: Any) -> State:
     )
 
 
+def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
+    """Free fall (3,) in the reference frame: stated by the recording, or found from its poses `raw()`."""
+    stated = recording.info.get("gravity_ref")
+    if stated is None:
+        stated = pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
+    return np.asarray(stated, float)
+
+
 def setup(recording: Recording, raw: Callable[[], Optical]) -> Setup:
     """Gravity and object frame of a recording; gravity found from its poses `raw()` where not stated."""
     info = recording.info
-    stated = info.get("gravity_ref")
-    if stated is None:
-        stated = pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
     frame = np.asarray(info.get("q_body_object", SETUP.q_body_object), float)
     return Setup(
-        np.asarray(stated, float),
+        gravity(recording, raw),
         np.asarray(info.get("p_body_object", SETUP.p_body_object), float),
         frame / np.linalg.norm(frame),
     )

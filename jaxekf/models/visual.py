@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, pose, projection, resection, rotation
+from jaxekf import linalg, projection, resection, rotation
 from jaxekf.errors import RecordingError
 from jaxekf.manifold import SO3, Euclidean
 from jaxekf.model import Model, Output, Parameters, Sensor, Start, repeated
@@ -298,14 +298,10 @@ def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
 
 def setup(recording: Recording) -> Setup:
     """The camera as stated, and gravity: stated, or found from images and accelerometer."""
-    stream, info = recording.need_camera(), recording.info
-    stated = info.get("gravity_ref")
-    if stated is None:
-        raw = resection.as_optical(stream)
-        stated = pose.gravity(raw, recording.need_imu(), recording.path or recording.name)
+    stream = recording.need_camera()
     turn = np.asarray(stream.q_body_camera, float)
     return Setup(
-        np.asarray(stated, float),
+        inertial.gravity(recording, lambda: resection.as_optical(stream)),
         np.asarray(stream.focal, float),
         np.asarray(stream.centre, float),
         np.asarray(stream.radial, float),
@@ -334,7 +330,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
         known["rate"] = imu.gyroscope[near]
         if imu.accelerometer is not None:
             force = to_scipy(raw.q_ref_body[first]).apply(imu.accelerometer[near])
-            known["acceleration"] = force + setup(recording).gravity_ref
+            known["acceleration"] = force + inertial.gravity(recording, lambda: raw)
     waited = (taken[first] - taken[0]) / NANOSECONDS
     note = ""
     if waited > 0.0:

@@ -246,8 +246,9 @@ def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
 def _rejected(record: SensorRecord, copies: int) -> int:
     """Samples, or where they are made of like groups these, of which the gate let nothing in."""
     gated, used = (
-        np.asarray(flags).reshape(len(flags) * copies, -1).any(axis=1)
-        for flags in (record.gated, record.used)
+        # The width is stated, as an array without samples has none that NumPy could work out.
+        flags.reshape(len(flags) * copies, flags.shape[1] // copies).any(axis=1)
+        for flags in (np.asarray(record.gated), np.asarray(record.used))
     )
     return int((gated & ~used).sum())
 

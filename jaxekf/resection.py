@@ -16,10 +16,16 @@ from jaxekf.recording import Camera, Flags, Floats, Optical, from_scipy, to_scip
 _FEWEST, _FEWEST_FLAT = 6, 4
 _SUBSETS = 24
 _ITERATIONS = 12
-_GOOD_START = 0.01
+_STILL = 1e-10
+"""Metres and radians: steps so small end the iterations."""
+_GOOD_START = 0.03
 """Median error, in focal lengths, from which Gauss and Newton arrive."""
 _FLAT = 1e-3
 """Landmarks are in one plane where they are this much thinner than wide."""
+_FLAT_START = 0.02
+"""The same where the plane is a start only."""
+_PLANES = 12
+"""Planes through three of the landmarks that are tried."""
 _CUTOFF = 4.685
 """Of Tukey's weight, in robust standard deviations: 95 % as good as least squares without mismatches."""
 _MAD = 1.4826
@@ -49,25 +55,28 @@ class Resection(NamedTuple):
 
 def poses(camera: Camera) -> Resection:
     """The pose of every image from at least six landmarks, or four that lie in one plane."""
-    usable = camera.usable
-    count = len(usable)
-    direction = _directions(camera)
+    images = np.flatnonzero(camera.usable.sum(axis=1) >= _FEWEST_FLAT)
+    points, order = _points(camera, images)
+    usable = points.usable
+    count = len(images)
+    direction = _directions(points)
     turn, away = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     valid = np.zeros(count, bool)
     rng = np.random.default_rng(0)
-    for i in np.flatnonzero(usable.sum(axis=1) >= _FEWEST_FLAT):
-        seen = np.flatnonzero(usable[i])
-        found = _start(direction[i, seen], camera.p_ref_landmark[seen], rng)
+    for i in range(count):
+        found = _start(direction[i, usable[i]], points.place[i, usable[i]], rng)
         if found is not None:
             turn[i], away[i], valid[i] = *found, True
     for _ in range(_ITERATIONS):
-        residual, slope = _linearised(camera, turn, away)
+        residual, slope = _linearised(points, turn, away)
         scale = _scale(residual, usable)
         weight = _weights(residual, scale, usable & valid[:, None])
         step, _ = _solved(residual, slope, weight)
         away = away + step[:, :3]
         turn = turn @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
-    residual, slope = _linearised(camera, turn, away)
+        if np.abs(step[valid]).max(initial=0.0) < _STILL:
+            break
+    residual, slope = _linearised(points, turn, away)
     scale = _scale(residual, usable)
     weight = _weights(residual, scale, usable & valid[:, None])
     counted = (weight > 0.0).sum(axis=1)
@@ -75,7 +84,22 @@ def poses(camera: Camera) -> Resection:
     valid &= counted >= np.maximum(_FEWEST_FLAT, _LEAST_SHARE * usable.sum(axis=1))
     valid &= np.isfinite(away).all(axis=1)
     _, information = _solved(residual, slope, weight)
-    return _of_body(camera, turn, away, information, scale, valid, weight > 0.0)
+    fits = np.zeros((count, len(camera.names)), bool)
+    np.put_along_axis(fits, order, (weight > 0.0) & valid[:, None], axis=1)
+    found = _of_body(camera, turn, away, information, scale, valid, fits)
+    return _among_all(found, images, len(camera.time_ns))
+
+
+def _among_all(found: Resection, images: Any, count: int) -> Resection:
+    """The poses of some images, and those of all others unknown."""
+    nothing = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros((6, 6)), 0.0, False, False)
+    every = []
+    for value, missing in zip(found, nothing, strict=True):
+        whole = np.empty((count, *value.shape[1:]), value.dtype)
+        whole[:] = missing
+        whole[images] = value
+        every.append(whole)
+    return Resection(*every)
 
 
 def as_optical(camera: Camera) -> Optical:
@@ -90,19 +114,45 @@ def as_optical(camera: Camera) -> Optical:
     )
 
 
-def _directions(camera: Camera) -> Floats:
-    """(N, L, 2) where the rays of the points meet the plane at distance 1, the lens undone."""
-    pixel = np.where(camera.usable[..., None], camera.pixel, camera.centre)
-    bent = (pixel - camera.centre) / camera.focal
+class _Points(NamedTuple):
+    """What is seen in N images, M landmarks in each at most, and the lens."""
+
+    pixel: Floats
+    """(N, M, 2), the centre of the image where not usable."""
+    place: Floats
+    """(N, M, 3) landmarks in the reference frame."""
+    usable: Flags
+    focal: Floats
+    centre: Floats
+    radial: Floats
+
+
+def _points(camera: Camera, images: Any) -> tuple[_Points, Any]:
+    """What is seen in some images, without the landmarks that are not, and which they are (N, M): of a
+    scene of hundreds an image shows a few."""
+    seen = camera.usable[images]
+    most = int(seen.sum(axis=1).max(initial=1))
+    order = np.argsort(~seen, axis=1, kind="stable")[:, :most]
+    usable = np.take_along_axis(seen, order, axis=1)
+    pixel = np.take_along_axis(camera.pixel[images], order[..., None], axis=1)
+    centre = np.asarray(camera.centre, float)
+    pixel = np.where(usable[..., None], pixel, centre)
+    lens = (np.asarray(camera.focal, float), centre, np.asarray(camera.radial, float))
+    return _Points(pixel, camera.p_ref_landmark[order], usable, *lens), order
+
+
+def _directions(points: _Points) -> Floats:
+    """(N, M, 2) where the rays of the points meet the plane at distance 1, the lens undone."""
+    bent = (points.pixel - points.centre) / points.focal
     point = bent
     for _ in range(8):
-        point = bent / _stretch(camera, point)[..., None]
+        point = bent / _stretch(points.radial, point)[..., None]
     return point
 
 
-def _stretch(camera: Camera, point: Floats) -> Floats:
+def _stretch(radial: Floats, point: Floats) -> Floats:
     r2 = np.sum(point * point, axis=-1)
-    return 1.0 + (camera.radial[0] + camera.radial[1] * r2) * r2
+    return 1.0 + (radial[0] + radial[1] * r2) * r2
 
 
 # --- the linear start ---------------------------------------------------------------------------------
@@ -113,30 +163,54 @@ def _start(
 ) -> tuple[Floats, Floats] | None:
     """The camera's axes in the reference frame (3, 3) and its place (3,), from points (M, 2) of landmarks
     (M, 3): of all linear solutions the one whose median error is least; None where there is none."""
-    middle = place.mean(axis=0)
-    thin = np.linalg.svd(place - middle, full_matrices=False)
-    flat = thin[1][2] <= _FLAT * thin[1][0]
-    if thin[1][1] <= _FLAT * thin[1][0] or (not flat and len(place) < _FEWEST):
+    everything = np.arange(len(place))
+    axes = np.linalg.svd(place - place.mean(axis=0), full_matrices=False)
+    if axes[1][1] <= _FLAT * axes[1][0]:
         return None
-    size, solve = (_FEWEST_FLAT, _homography) if flat else (_FEWEST, _linear)
+    ways: list[tuple[Any, Any, int]] = []
+    if axes[1][2] > _FLAT * axes[1][0]:
+        if len(place) < _FEWEST:
+            return None
+        ways.append((_linear, everything, _FEWEST))
+        # A few landmarks beside a plane that holds the others tell the linear transform next to nothing.
+        plane = _largest_plane(place, rng)
+        if len(plane) >= _FEWEST:
+            ways.append((_homography, plane, _FEWEST_FLAT))
+    else:
+        ways.append((_homography, everything, _FEWEST_FLAT))
     best, least = None, np.inf
-    for number in range(1 + _SUBSETS if len(place) > size else 1):
-        subset = rng.permutation(len(place))[:size] if number else np.arange(len(place))
-        found = solve(direction[subset], place[subset], thin[2])
-        if found is None:
-            continue
-        inside = (place - found[1]) @ found[0]
-        depth = np.maximum(inside[:, 2:], NEAREST)
-        off = np.linalg.norm(inside[:, :2] / depth - direction, axis=1)
-        off[inside[:, 2] <= NEAREST] = np.inf
-        if (middling := float(np.median(off))) < least:
-            best, least = found, middling
-        if least < _GOOD_START:
-            break
+    for number in range(1 + _SUBSETS):
+        for solve, members, size in ways:
+            if number and len(members) == size:
+                continue
+            subset = rng.permutation(members)[:size] if number else members
+            found = solve(direction[subset], place[subset])
+            if found is None:
+                continue
+            inside = (place - found[1]) @ found[0]
+            depth = np.maximum(inside[:, 2:], NEAREST)
+            off = np.linalg.norm(inside[:, :2] / depth - direction, axis=1)
+            off[inside[:, 2] <= NEAREST] = np.inf
+            if (middling := float(np.median(off))) < least:
+                best, least = found, middling
+            if least < _GOOD_START:
+                return best
     return best
 
 
-def _linear(direction: Floats, place: Floats, _: Floats) -> tuple[Floats, Floats] | None:
+def _largest_plane(place: Floats, rng: np.random.Generator) -> Any:
+    """Which of the landmarks (M, 3) lie in the plane that holds the most of them, of some planes tried."""
+    corners = place[rng.integers(len(place), size=(_PLANES, 3))]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal / np.maximum(length, 1e-12)[:, None]
+    off = np.abs(np.einsum("kmi,ki->km", place - corners[:, :1], normal))
+    size = np.sqrt(np.mean((place - place.mean(axis=0)) ** 2))
+    inside = (off <= _FLAT_START * size) & (length > _FLAT * size**2)[:, None]
+    return np.flatnonzero(inside[np.argmax(inside.sum(axis=1))])
+
+
+def _linear(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
     """By the direct linear transform: the matrix (3, 4) that takes landmarks to their rays."""
     middle = place.mean(axis=0)
     size = np.sqrt(np.mean((place - middle) ** 2)) + 1e-12
@@ -154,9 +228,10 @@ def _linear(direction: Floats, place: Floats, _: Floats) -> tuple[Floats, Floats
     return towards.T, middle - size * towards.T @ matrix[:, 3] / s.mean()
 
 
-def _homography(direction: Floats, place: Floats, axes: Floats) -> tuple[Floats, Floats] | None:
-    """From landmarks in the plane of the first two of `axes` (rows)."""
+def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
+    """From landmarks that lie in one plane, or nearly so."""
     middle = place.mean(axis=0)
+    axes = np.linalg.svd(place - middle, full_matrices=False)[2]
     inside = (place - middle) @ axes[:2].T
     size = np.sqrt(np.mean(inside**2)) + 1e-12
     scaled = np.concatenate([inside / size, np.ones((len(place), 1))], axis=1)
@@ -184,20 +259,20 @@ def _null(matrix: Floats) -> Floats:
 # --- Gauss and Newton ---------------------------------------------------------------------------------
 
 
-def _linearised(camera: Camera, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
-    """Residuals (N, L, 2), pixels, and their derivatives (N, L, 2, 6) by the camera's place in the
+def _linearised(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
+    """Residuals (N, M, 2), pixels, and their derivatives (N, M, 2, 6) by the camera's place in the
     reference frame and its turn in its own, at its axes (N, 3, 3) and place (N, 3)."""
-    inside = (camera.p_ref_landmark[None] - away[:, None]) @ turn
+    inside = (points.place - away[:, None]) @ turn
     depth = np.maximum(inside[..., 2], NEAREST)
     point = inside[..., :2] / depth[..., None]
-    r2, stretch = np.sum(point * point, axis=-1), _stretch(camera, point)
-    seen = camera.focal * point * stretch[..., None] + camera.centre
-    pixel = np.where(camera.usable[..., None], camera.pixel, seen)
+    r2, stretch = np.sum(point * point, axis=-1), _stretch(points.radial, point)
+    seen = points.focal * point * stretch[..., None] + points.centre
+    pixel = np.where(points.usable[..., None], points.pixel, seen)
     # By the point: of ``point * stretch``; then by the landmark in the camera's frame.
-    bent = 2.0 * (camera.radial[0] + 2.0 * camera.radial[1] * r2)
+    bent = 2.0 * (points.radial[0] + 2.0 * points.radial[1] * r2)
     by_point = stretch[..., None, None] * np.eye(2)
     by_point = by_point + bent[..., None, None] * point[..., :, None] * point[..., None, :]
-    by_point = camera.focal[:, None] * by_point
+    by_point = points.focal[:, None] * by_point
     by_inside = np.zeros((*depth.shape, 2, 3))
     by_inside[..., 0, 0] = by_inside[..., 1, 1] = 1.0 / depth
     by_inside[..., 2] = -point / depth[..., None]
@@ -217,22 +292,26 @@ def _cross(vector: Floats) -> Floats:
 
 def _scale(residual: Floats, usable: Flags) -> Floats:
     """(N,) robust standard deviation of each coordinate, pixels."""
-    size = np.where(usable[..., None], np.abs(residual), np.nan).reshape(len(residual), -1)
+    size = np.where(usable[..., None], np.abs(residual), np.nan)
+    size = size.reshape(len(residual), 2 * residual.shape[1])
     empty = ~usable.any(axis=1)
     size[empty] = 0.0
     return np.maximum(_MAD * np.nanmedian(size, axis=1), 1e-9)
 
 
 def _weights(residual: Floats, scale: Floats, usable: Flags) -> Floats:
-    """(N, L) Tukey's weights of points by how far they are off."""
+    """(N, M) Tukey's weights of points by how far they are off."""
     off = np.linalg.norm(residual, axis=-1) / (_CUTOFF * scale)[:, None]
     return np.where(usable & (off < 1.0), (1.0 - np.minimum(off, 1.0) ** 2) ** 2, 0.0)
 
 
 def _solved(residual: Floats, slope: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Steps (N, 6) of Gauss and Newton, and the information (N, 6, 6) at unit noise."""
-    information = np.einsum("nl,nlri,nlrj->nij", weight, slope, slope)
-    pull = np.einsum("nl,nlri,nlr->ni", weight, slope, residual)
+    count, most = weight.shape
+    flat = slope.reshape(count, 2 * most, 6)
+    weighted = (slope * weight[..., None, None]).reshape(count, 2 * most, 6)
+    information = np.swapaxes(weighted, 1, 2) @ flat
+    pull = np.einsum("nri,nr->ni", weighted, residual.reshape(count, 2 * most))
     size = np.trace(information, axis1=1, axis2=2)
     some = np.maximum(size, 1.0)[:, None, None] * 1e-12 * np.eye(6)
     return np.linalg.solve(information + some, pull[..., None])[..., 0], information + some
@@ -262,4 +341,4 @@ def _of_body(
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     q = np.where(valid[:, None], from_scipy(body), identity)
     where = np.where(valid[:, None], position, 0.0)
-    return Resection(q, where, cov, scale, valid, fits & valid[:, None])
+    return Resection(q, where, cov, scale, valid, fits)

@@ -14,7 +14,8 @@ from jaxekf.rows import Intake
 
 def visible(samples: Samples) -> NDArray[np.bool_]:
     """(N,) samples of which some row is visible."""
-    return np.asarray(samples.mask.reshape(len(samples.mask), -1).any(axis=1))
+    mask = samples.mask
+    return np.asarray(mask.any(axis=tuple(range(1, mask.ndim))))
 
 
 def first_visible(samples: Samples) -> Any:
@@ -29,7 +30,8 @@ def count(samples: Samples, start: int, end: int) -> dict[str, int]:
     """The account of a stream in a run from `start` to `end`, ns."""
     inside = (samples.time_ns >= start) & (samples.time_ns <= end)
     if samples.points is not None:
-        groups = samples.mask.reshape(len(samples.mask), samples.copies, -1).any(axis=2)
+        rows = samples.mask.shape[1] // samples.copies
+        groups = samples.mask.reshape(len(samples.mask), samples.copies, rows).any(axis=2)
         seen, there = groups.sum(axis=1), samples.points
         return {
             "read": int(there.sum()),

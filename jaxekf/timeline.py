@@ -210,7 +210,7 @@ def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recor
     is masked.
     """
     values = np.array(values)
-    known = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     shown = mask.any(axis=1)
     bad = np.flatnonzero(shown & ~known)
     if bad.size:

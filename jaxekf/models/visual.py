@@ -20,28 +20,19 @@ import numpy as np
 from jax import Array
 
 from jaxekf import linalg, projection, resection, rotation
-from jaxekf.errors import RecordingError
 from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Model, Output, Parameters, Sensor, Start, repeated
-from jaxekf.models import inertial, sources
+from jaxekf.model import Model, Output, Parameters, Sensor, repeated
+from jaxekf.models import correspondences, inertial, sources
+from jaxekf.models.correspondences import Point, SeenPoint
 from jaxekf.projection import Lens
 from jaxekf.recording import (
-    NANOSECONDS,
-    Camera,
-    Flags,
-    Floats,
     Recording,
     Samples,
-    Times,
-    to_scipy,
 )
 
 GATE = 0.999
 _FEWEST = 8
 """Groups of an image that a model has at least; it has a multiple of them, so that few are compiled."""
-_LINE_S = 0.35
-_NEAR_S = 0.1
-"""An IMU sample so near to the first image tells acceleration and rate there."""
 
 
 class State(NamedTuple):
@@ -116,26 +107,6 @@ class Setup(NamedTuple):
     """(3,) metres."""
     q_body_camera: Any
     """(4,)"""
-
-
-class Point(NamedTuple):
-    """Of one correspondence: its landmark, and how well the image point is known."""
-
-    p_ref_landmark: Any
-    """(3,) metres."""
-    sigma: Any
-    """Reported standard deviation, pixels; 0 where none was reported; ()."""
-
-
-class SeenPoint(NamedTuple):
-    """The same where the image point goes into the slope."""
-
-    p_ref_landmark: Any
-    sigma: Any
-    pixel: Any
-    """(2,) the image point."""
-    depth: Any
-    """Metres along the optical axis, from the pose of the image alone; ()."""
 
 
 SPACE: Any = State(
@@ -240,62 +211,6 @@ def accelerometer(recording: Recording) -> Samples:
     return Samples(both.time_ns, both.value[:, 3:], both.mask, origin=both.origin)
 
 
-def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
-    """The image points (N, 2 count) of up to `count` landmarks of each image, the first of them in the
-    order of the landmarks; of the bilinear form zeros."""
-    stream = recording.need_camera()
-    usable = stream.usable
-    # The landmarks that are seen, in order, then others to fill up.
-    order = np.argsort(~usable, axis=1, kind="stable")[:, :count]
-    here = np.arange(len(stream.time_ns))[:, None]
-    mask = usable[here, order]
-    pixel = np.where(mask[..., None], stream.pixel[here, order], 0.0)
-    short = count - order.shape[1]
-    sigma = np.zeros(mask.shape)
-    if stream.sigma is not None:
-        sigma = np.nan_to_num(np.where(mask, stream.sigma[here, order], 0.0))
-    place = stream.p_ref_landmark[order]
-    place, sigma, value = (_filled(a, short) for a in (place, sigma, pixel))
-    aux: Any = Point(place, sigma)
-    if bilinear:
-        aux = SeenPoint(place, sigma, value, _depth(stream, place, recording))
-        value = np.zeros_like(value)
-    rows = np.repeat(_filled(mask, short), 2, axis=1)
-    taken = stream.time_ns - stream.latency_ns
-    flat = value.reshape(len(value), -1)
-    there = stream.visible.sum(axis=1)
-    known = (stream.latency_ns, ("camera",))
-    return Samples(taken, flat, rows, aux, *known, points=there, copies=count)
-
-
-def _filled(values: Any, short: int) -> Any:
-    """So many more groups (axis 1), copies of the first."""
-    return np.concatenate([values, np.repeat(values[:, :1], short, axis=1)], axis=1)
-
-
-def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
-    """Depths (N, M), metres, of landmarks (N, M, 3) from the poses of the images alone, those of the
-    nearest image that has one."""
-    found = resection.poses(stream)
-    known = np.flatnonzero(found.valid)
-    if known.size == 0:
-        raise RecordingError(
-            recording.path or recording.name,
-            "no image from which a pose follows",
-            "one, whose depths the bilinear form needs",
-            "the model visual, or a run with six landmarks in an image",
-        )
-    at = known[np.argmin(np.abs(np.arange(len(found.valid))[:, None] - known[None]), axis=1)]
-    away = place - found.position[at][:, None]
-    inside = np.stack(
-        [to_scipy(found.q_ref_body[at]).inv().apply(away[:, i]) for i in range(away.shape[1])],
-        axis=1,
-    )
-    forward = to_scipy(stream.q_body_camera).inv()
-    flat = (inside - stream.p_body_camera).reshape(-1, 3)
-    return np.maximum(forward.apply(flat)[:, 2].reshape(place.shape[:2]), projection.NEAREST)
-
-
 def setup(recording: Recording) -> Setup:
     """The camera as stated, and gravity: stated, or found from images and accelerometer."""
     stream = recording.need_camera()
@@ -308,44 +223,6 @@ def setup(recording: Recording) -> Setup:
         np.asarray(stream.p_body_camera, float),
         turn / np.linalg.norm(turn),
     )
-
-
-def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first image from which a pose follows, with the IMU beside it."""
-    stream, imu = recording.need_camera(), recording.need_imu()
-    raw = resection.as_optical(stream)
-    taken = raw.time_ns - raw.latency_ns
-    valid = raw.valid & np.isin(taken, samples["camera"].time_ns)
-    valid &= (taken >= imu.time_ns[0]) & (taken <= imu.time_ns[-1])
-    if not valid.any() or raw.position is None:
-        return None
-    first = int(np.argmax(valid))
-    known: dict[str, Any] = {
-        "position": raw.position[first],
-        "q_ref_body": raw.q_ref_body[first],
-        "velocity": _velocity(taken, raw.position, valid, first),
-    }
-    near = int(np.argmin(np.abs(imu.time_ns - taken[first])))
-    if abs(int(imu.time_ns[near] - taken[first])) <= _NEAR_S * NANOSECONDS:
-        known["rate"] = imu.gyroscope[near]
-        if imu.accelerometer is not None:
-            force = to_scipy(raw.q_ref_body[first]).apply(imu.accelerometer[near])
-            known["acceleration"] = force + inertial.gravity(recording, lambda: raw)
-    waited = (taken[first] - taken[0]) / NANOSECONDS
-    note = ""
-    if waited > 0.0:
-        note = f"waited {waited:.3f} s for an image from which a pose follows, to start from"
-    return Start(int(taken[first]), known, note)
-
-
-def _velocity(taken: Times, position: Floats, valid: Flags, first: int) -> Floats:
-    """Velocity (3,), m/s, at an image: slope of a line through the positions of the third of a second from
-    there, since those of single images are too uncertain for a difference; 0 where there is one only."""
-    t = (taken - taken[first]) / NANOSECONDS
-    near = valid & (t >= 0.0) & (t <= _LINE_S)
-    if near.sum() < 2:
-        return np.zeros(3)
-    return np.polynomial.polynomial.polyfit(t[near], position[near], 1)[1]
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
@@ -454,7 +331,7 @@ def _point(count: int, bilinear: bool) -> Sensor:
         Euclidean(2, "m" if bilinear else "px"),
         predict_bilinear if bilinear else predict_point,
         bilinear_noise if bilinear else point_noise,
-        partial(camera, count, bilinear),
+        partial(correspondences.camera, count, bilinear),
         gate=GATE,
         aux_like=like,
     )
@@ -491,7 +368,7 @@ def _build(count: int, bilinear: bool) -> Model:
         noise_dims=Noise(3, 3, 3, 3, 3, 3, 1),
         initial_mean=initial_mean,
         initial_covariance=inertial.initial_covariance,
-        find_start=find_start,
+        find_start=correspondences.find_start,
         adapt=partial(adapt, bilinear),
         setup=setup,
         outputs=OUTPUTS,

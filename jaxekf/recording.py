@@ -162,6 +162,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         count, images = len(self.names), len(self.time_ns)
+        if count == 0:
+            raise RecordingError(
+                "camera", "no landmark", "at least one", "naming the landmarks of the scene"
+            )
         shapes = {
             "pixel": (images, count, 2),
             "visible": (images, count),

@@ -26,7 +26,7 @@ class Regions(NamedTuple):
     """(L,) whether the landmark lies in front of the camera; of others nothing is known."""
 
 
-def search_regions(params: Parameters, belief: Belief, p_ref_landmark: Array) -> Regions:
+def search_regions(params: Parameters, belief: Belief, p_ref_landmark: Array | Floats) -> Regions:
     """Regions of landmarks (L, 3), metres, in an image taken when the body is where `belief` of the model
     `visual` says; to be mapped over instants with `vmap`.
 

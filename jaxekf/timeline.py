@@ -305,7 +305,7 @@ def _span(
             place,
             f"no instant at which '{model.name}' can start",
             "at least one (see the model)",
-            "a run in which enough of the tool is seen at once",
+            "a run in which enough is seen at once: markers of the tool, or landmarks in an image",
         )
     return found.time_ns, end, found
 

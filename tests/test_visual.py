@@ -234,6 +234,20 @@ def test_images_without_a_pose_are_told():
     np.testing.assert_allclose(found.position[1::2], whole.position[1::2], atol=1e-8)
 
 
+def test_cameras_that_see_nothing_are_refused():
+    """Would catch an array of no rows that NumPy cannot shape, instead of a sentence."""
+    run = camera_recording("run", seed=2, duration_s=1.0, grade=few())
+    camera = run.camera
+    with pytest.raises(jaxekf.RecordingError, match="no landmark"):
+        replace(camera, names=(), pixel=camera.pixel[:, :0], visible=camera.visible[:, :0])
+    nothing = {"pixel": camera.pixel[:0], "visible": camera.visible[:0]}
+    empty = replace(camera, time_ns=camera.time_ns[:0], **nothing)
+    dark = replace(camera, visible=np.zeros_like(camera.visible))
+    for changed, said in ((empty, "0 samples in camera"), (dark, "landmarks in an image")):
+        with pytest.raises(jaxekf.RecordingError, match=said):
+            jaxekf.estimate(run.replace(camera=changed), "visual")
+
+
 def test_a_start_is_sought_where_a_pose_follows():
     """Would catch a start from images before the first with a pose, or from too few of them: solving for
     all images of an hour to start from the first would take minutes."""

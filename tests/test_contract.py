@@ -118,6 +118,11 @@ def input_at(model, steps, k=1, s=-1):
 
 
 every_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
+every_filter = pytest.mark.parametrize(
+    # The bilinear form shares all but its measurement with `visual`.
+    "name",
+    scenario.long_form(list(MODELS), {"visual_bilinear"}),
+)
 
 
 @every_model
@@ -221,9 +226,10 @@ def test_sensor_jacobians(model):
         assert np.linalg.eigvalsh(noise).min() > 0.0
 
 
-@every_model
-def test_masked_step_only_predicts(model):
+@every_filter
+def test_masked_step_only_predicts(name):
     """A hidden sample that moves the state or scales the covariance, or a wrong prediction."""
+    model = MODELS[name]
     given, params = data(model, 0), parameters(model)
     output = run_epochs(model, given._replace(epochs=masked(given.epochs)))
     instants = output.instants
@@ -244,10 +250,11 @@ def test_masked_step_only_predicts(model):
     assert_tree_close(after, Belief(predicted, cov), 1e-13)
 
 
-@every_model
-def test_partly_masked_run(model):
+@every_filter
+def test_partly_masked_run(name):
     """A covariance that is lopsided or not definite; instants without samples that are not pure
     prediction; samples that are there but not used."""
+    model = MODELS[name]
     given = data(model, 1)
     for rows in (given.epochs.fast | given.epochs.slow).values():
         rows.mask[3] = False
@@ -298,9 +305,10 @@ def test_gradients(name):
         assert np.any(leaf != 0.0), jax.tree_util.keystr(path)
 
 
-@every_model
-def test_one_compilation(model):
+@every_filter
+def test_one_compilation(name):
     """A filter that is compiled again for other values, masks or parameters of the same shape."""
+    model = MODELS[name]
     run_epochs(model, data(model, 0))
     compiled = scenario.run_filter._cache_size()
     first = run_epochs(model, data(model, 2)).instants.log_likelihood

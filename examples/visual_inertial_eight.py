@@ -157,7 +157,7 @@ def draw_searched(axes: Any, run: Recording) -> None:
         xlim=(0, IMAGE[0]), ylim=(IMAGE[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)"
     )
     axes.set(title="the first image after the gap")
-    axes.legend(fontsize=8, loc="upper right")
+    axes.legend(fontsize=8, loc="lower left")
 
 
 def figure(run: Recording, one: Any) -> Any:
@@ -179,7 +179,7 @@ def figure(run: Recording, one: Any) -> Any:
     )
     path.plot(*at.position[:, 1::-1].T, color=style.TRUTH, lw=1.0, label="truth")
     path.plot(*place[:, 1::-1].T, color=style.ESTIMATE, lw=1.0, label="fused")
-    path.legend(fontsize=8)
+    path.legend(fontsize=8, loc="upper center")
     path.set(xlabel="y (m)", ylabel="x, up (m)", title="the eight", aspect="equal")
     seconds = (run.need_camera().time_ns - one.time_ns[0]) / 1e9
     truth = at.position[:, 0]

@@ -1,7 +1,7 @@
 """Other models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import toy_models
 
 _RUNS, _STEPS, _DT = 64, 500, 0.01
+
+
+def _ungated(model: Model) -> Model:
+    return replace(model, sensors=tuple(replace(s, gate=None) for s in model.sensors))
 
 
 def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> tuple[Any, Array]:
@@ -112,20 +116,21 @@ def _steps(model: Model, runs: int) -> Steps:
     return Steps(time, dt, np.ones((runs, _STEPS, 1), bool), knots, fast, {})
 
 
-def _ungated(model: Model) -> Model:
-    return replace(model, sensors=tuple(replace(s, gate=None) for s in model.sensors))
+CONTENDERS = {
+    "loose": loose.MODEL,
+    "tight": _ungated(tight.MODEL),
+    "triad": triad.MODEL,
+    "marg": marg.MODEL,
+    "markers": _ungated(toy_models.MARKERS),
+}
+"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; a toy of 15 degrees of freedom."""
 
 
-def race(seconds: float) -> dict[str, dict[str, float]]:
+def race(seconds: float, names: Sequence[str] = tuple(CONTENDERS)) -> dict[str, dict[str, float]]:
     """Microseconds per step and run of both, forward and value with gradient to all parameters."""
     found = {}
-    for name, model in (
-        ("loose", loose.MODEL),
-        ("tight, three markers", _ungated(tight.MODEL)),
-        ("triad", triad.MODEL),
-        ("marg, 12 d.o.f., 9 rows", marg.MODEL),
-        ("toy of markers, 15 d.o.f.", _ungated(toy_models.MARKERS)),
-    ):
+    for name in names:
+        model = CONTENDERS[name]
         params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
         steps = jax.tree.map(jnp.asarray, _steps(model, _RUNS))
         x = model.initial_mean({})

@@ -1,4 +1,4 @@
-"""Race of filters on the same work: ``python benchmarks/speed.py [--quick]``.
+"""Race of filters on the same work: ``python benchmarks/speed.py [--quick] [--models marg triad]``.
 
 Prints a table of microseconds per step and run (medians), the first-call seconds and the peak memory, and
 last one line of JSON. All filters must agree before any is timed.
@@ -77,7 +77,19 @@ def main() -> None:
     """Run the race."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer runs, shorter timing")
-    quick = parser.parse_args().quick
+    parser.add_argument(
+        "--models",
+        nargs="+",
+        choices=list(models.CONTENDERS),
+        help="these other models alone, against textbook JAX",
+    )
+    arguments = parser.parse_args()
+    quick = arguments.quick
+    if arguments.models:
+        other = models.race(0.5 if quick else 3.0, arguments.models)
+        show_models(Console(width=110), other)
+        print(json.dumps({"other_models_us_per_step_per_run": other}))
+        return
     filters = contenders()
     agree(filters)
     where = {
@@ -186,6 +198,13 @@ def show(
         ]
         table.add_row(name, *cells)
     console.print(table)
+    show_models(console, other)
+    for name, value in ratios(speed).items():
+        print(f"{name}: {value:g}")
+
+
+def show_models(console: Console, other: dict[str, dict[str, float]]) -> None:
+    """The table of other models."""
     table = Table(title="other models, 64 runs: microseconds per step and run")
     for column in ("model", "jaxekf", "textbook JAX", "ratio"):
         table.add_column(column, justify="left" if column == "model" else "right")
@@ -193,8 +212,6 @@ def show(
         own, plain = row["jaxekf"], row["textbook JAX"]
         table.add_row(name, f"{own:.3f}", f"{plain:.3f}", f"{plain / own:.1f}")
     console.print(table)
-    for name, value in ratios(speed).items():
-        print(f"{name}: {value:g}")
 
 
 def processor() -> str:

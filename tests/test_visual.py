@@ -291,6 +291,20 @@ def test_a_point_that_no_lens_maps_is_no_point():
     assert resection.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
 
 
+def test_points_that_fit_no_pose_are_not_called_too_few():
+    """Would catch a user whose names or lens are wrong being sent to record more landmarks."""
+    run = camera_recording("run", seed=2, duration_s=1.0, grade=few())
+    camera = run.camera
+    mixed = np.random.default_rng(0).permutation(len(camera.names))
+    for changed in (
+        replace(camera, p_ref_landmark=camera.p_ref_landmark[mixed]),
+        replace(camera, focal=np.array([3.2, 3.2])),
+    ):
+        with pytest.raises(jaxekf.RecordingError, match="none of which fits any pose") as told:
+            jaxekf.estimate(run.replace(camera=changed), "visual")
+        assert "names" in str(told.value)
+
+
 def test_gravity_off_by_a_degree():
     """Would catch gravity that is subtracted in the wrong frame: without vision 1 deg is 0.17 m/s^2, and
     8.5 cm after a second, as the source says (row 5)."""

@@ -20,6 +20,8 @@ _STILL = 1e-10
 """Metres and radians: steps so small end the iterations."""
 _GOOD_START = 0.03
 """Median error, in focal lengths, from which Gauss and Newton arrive."""
+_WIDEST = 1e3
+"""A ray that meets the plane at distance 1 farther from the axis is no lens's."""
 _FLAT = 1e-3
 """Landmarks are in one plane where they are this much thinner than wide."""
 _FLAT_START = 0.02
@@ -57,13 +59,15 @@ def poses(camera: Camera) -> Resection:
     """The pose of every image from at least six landmarks, or four that lie in one plane."""
     images = np.flatnonzero(camera.usable.sum(axis=1) >= _FEWEST_FLAT)
     points, order = _points(camera, images)
-    usable = points.usable
-    count = len(images)
     direction = _directions(points)
+    # Of one point that no lens maps, or that is huge, the sums of its image would not be finite.
+    usable = points.usable & np.asarray((np.abs(direction) < _WIDEST).all(axis=2))
+    points = points._replace(usable=usable)
+    count = len(images)
     turn, away = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     valid = np.zeros(count, bool)
     rng = np.random.default_rng(0)
-    for i in range(count):
+    for i in np.flatnonzero(usable.sum(axis=1) >= _FEWEST_FLAT):
         found = _start(direction[i, usable[i]], points.place[i, usable[i]], rng)
         if found is not None:
             turn[i], away[i], valid[i] = *found, True
@@ -145,8 +149,9 @@ def _directions(points: _Points) -> Floats:
     """(N, M, 2) where the rays of the points meet the plane at distance 1, the lens undone."""
     bent = (points.pixel - points.centre) / points.focal
     point = bent
-    for _ in range(8):
-        point = bent / _stretch(points.radial, point)[..., None]
+    with np.errstate(all="ignore"):
+        for _ in range(8):
+            point = bent / _stretch(points.radial, point)[..., None]
     return point
 
 

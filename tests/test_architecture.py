@@ -56,7 +56,7 @@ ORDER = [
     ("backward",),
     ("ekf", "models.sources", "storage"),
     ("models.loose", "models.inertial"),
-    ("models.earth",),
+    ("models.earth", "models.correspondences"),
     (
         "models.loose_rate",
         "models.loose_additive",

@@ -267,6 +267,44 @@ def test_a_start_is_sought_where_a_pose_follows():
     np.testing.assert_allclose(start.first["velocity"], slope, atol=1e-6)
 
 
+def test_a_point_that_no_lens_maps_is_no_point():
+    """Would catch sums of an image that one huge point makes infinite, so that no image has a pose."""
+    camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
+    known = resection.poses(camera)
+    image, landmark = np.argwhere(camera.usable)[0]
+    # A point at which the lens maps nothing: ``1 + radial r^2`` is 0 there.
+    bent = replace(camera, radial=np.array([-0.25, 0.0]))
+    for changed, pixel in (
+        (camera, [1e300, -1e300]),
+        (bent, camera.centre + np.array([2.0 * camera.focal[0], 0.0])),
+    ):
+        point = camera.pixel.copy()
+        point[image, landmark] = pixel
+        found = resection.poses(replace(changed, pixel=point))
+        assert not found.fits[image, landmark]
+        assert np.isfinite(found.position).all()
+        if changed is camera:
+            assert found.valid.tolist() == known.valid.tolist()
+            np.testing.assert_allclose(found.position[1:], known.position[1:], atol=1e-8)
+    point = camera.pixel.copy()
+    point[image] = 1e300
+    assert resection.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
+
+
+def test_points_that_fit_no_pose_are_not_called_too_few():
+    """Would catch a user whose names or lens are wrong being sent to record more landmarks."""
+    run = camera_recording("run", seed=2, duration_s=1.0, grade=few())
+    camera = run.camera
+    mixed = np.random.default_rng(0).permutation(len(camera.names))
+    for changed in (
+        replace(camera, p_ref_landmark=camera.p_ref_landmark[mixed]),
+        replace(camera, focal=np.array([3.2, 3.2])),
+    ):
+        with pytest.raises(jaxekf.RecordingError, match="none of which fits any pose") as told:
+            jaxekf.estimate(run.replace(camera=changed), "visual")
+        assert "names" in str(told.value)
+
+
 def test_gravity_off_by_a_degree():
     """Would catch gravity that is subtracted in the wrong frame: without vision 1 deg is 0.17 m/s^2, and
     8.5 cm after a second, as the source says (row 5)."""

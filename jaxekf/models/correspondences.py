@@ -25,6 +25,8 @@ from jaxekf.recording import (
 _LINE_S = 0.35
 _NEAR_S = 0.1
 """An IMU sample so near to the first image tells acceleration and rate there."""
+_ENOUGH = 6
+"""Landmarks from which a pose follows wherever they are."""
 _FIRST = 16
 """Images that are solved for at first to find a start."""
 
@@ -113,6 +115,16 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     fit &= (taken >= imu.time_ns[0]) & (taken <= imu.time_ns[-1])
     raw, valid = _first_poses(stream, fit)
     if not valid.any() or raw.position is None:
+        enough = int((stream.usable[fit].sum(axis=1) >= _ENOUGH).sum())
+        if enough:
+            # Another run would not help who has named the landmarks or stated the lens wrongly.
+            raise RecordingError(
+                recording.path or recording.name,
+                f"{enough} images of {_ENOUGH} landmarks or more, none of which fits any pose",
+                "points that lie where the landmarks appear",
+                "correcting the camera's focal, centre and radial (in pixels of these images), the"
+                " landmarks' names, or their places",
+            )
         return None
     first = int(np.argmax(valid))
     known: dict[str, Any] = {

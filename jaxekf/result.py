@@ -37,6 +37,11 @@ class OutputEstimate:
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
 
+def trackers(sensors: Iterable[str]) -> list[str]:
+    """Those of a model's sensors that see where the body is: a tracker, its markers, or a camera."""
+    return [s for s in sensors if s in ("optical", "camera") or s.startswith("marker_")]
+
+
 class Estimated(Protocol):
     """What an estimate says over time, made just now or read from a result folder."""
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +15,14 @@ from scipy.stats import chi2
 import jaxekf
 import tuning
 from jaxekf import ekf, linalg, manifold, regions, resection, simulate, simulate_camera, timeline
+from jaxekf.cli.estimate import _row as table_row
 from jaxekf.model import Belief
 from jaxekf.models import correspondences, visual
 from jaxekf.parameters import as_arrays
 from jaxekf.recording import from_scipy, to_scipy
 from jaxekf.simulate_camera import CameraGrade, camera_recording
 from jaxekf.truth import encoder_at
+from tuning.validation import _tracker_nis as tracker_nis
 
 POINTS, SECONDS = 8, 5.0
 """The same for all runs that are estimated: one compilation."""
@@ -289,6 +292,18 @@ def test_a_point_that_no_lens_maps_is_no_point():
     point = camera.pixel.copy()
     point[image] = 1e300
     assert resection.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
+
+
+def test_tables_count_a_camera_as_the_tracker():
+    """Would catch `0 of 0` rows and no NIS of a run with a camera, and a mean over the IMU beside it: that
+    the gyroscope is predicted badly says nothing of the images."""
+    nis = {"accelerometer": 0.4, "gyroscope": 0.02, "camera": 0.9}
+    account = {name: {"used": 7, "read": 8} for name in nis}
+    assert [s.name for s in visual.MODEL.sensors] == list(nis)
+    summary = {"run": "a", "duration_s": 1.0, "account": account, "mean_nis": nis}
+    assert table_row(summary, ())[2:] == [0.9, "7 of 8"]
+    assert tracker_nis(SimpleNamespace(sensors=nis, mean_nis=nis.get)) == 0.9
+    assert tracker_nis(SimpleNamespace(sensors={"own": 0.5}, mean_nis={"own": 0.5}.get)) == 0.5
 
 
 def test_points_that_fit_no_pose_are_not_called_too_few():

@@ -8,7 +8,7 @@ from jaxekf.estimation import Run, estimate_many
 from jaxekf.metrics import score, score_hold_last, score_raw_rate
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Recording
-from jaxekf.result import Estimate
+from jaxekf.result import Estimate, trackers
 
 
 class Row(NamedTuple):
@@ -78,8 +78,8 @@ def compare(
 
 
 def _tracker_nis(estimate: Estimate) -> float:
-    """Of the sensor called optical, or of all where the model has none."""
-    names = ["optical"] if "optical" in estimate.sensors else list(estimate.sensors)
+    """Of what sees where the body is, or of all sensors of a model that has nothing of the kind."""
+    names = trackers(estimate.sensors) or list(estimate.sensors)
     return sum(estimate.mean_nis(name) for name in names) / len(names)
 
 

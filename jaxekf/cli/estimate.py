@@ -31,7 +31,7 @@ from jaxekf.models import get_model
 from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
 from jaxekf.requested import Every, Requested, every, read_requested
-from jaxekf.result import Estimate
+from jaxekf.result import Estimate, trackers
 from jaxekf.robust import Means, robust
 
 
@@ -274,9 +274,9 @@ def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
 def _row(summary: dict[str, Any], scores: tuple[str, ...]) -> list[Any]:
     judged = summary.get("score", {})
     nan = float("nan")
-    trackers = [n for n in summary["account"] if n == "optical" or n.startswith("marker_")]
-    used, read = (sum(summary["account"][n].get(k, 0) for n in trackers) for k in ("used", "read"))
-    known = [v for v in (summary["mean_nis"].get(n) for n in trackers) if v is not None]
+    seeing = trackers(summary["account"])
+    used, read = (sum(summary["account"][n].get(k, 0) for n in seeing) for k in ("used", "read"))
+    known = [v for v in (summary["mean_nis"].get(n) for n in seeing) if v is not None]
     return [
         summary["run"],
         summary["duration_s"],

@@ -12,6 +12,7 @@ from jaxekf.metrics import Score
 from jaxekf.plots.sight import Sight, Stretch, look
 from jaxekf.recording import NANOSECONDS, Floats, Recording, period_ns
 from jaxekf.report.saved import SavedResult
+from jaxekf.result import trackers
 
 _NAN = float("nan")
 _GAP_PERIODS = 2.5
@@ -91,11 +92,7 @@ def _difference(result: SavedResult, recording: Recording) -> str:
 
 def _unseen(result: SavedResult) -> list[Stretch]:
     """Stretches without a sample of any tracker, told by the innovations alone."""
-    seen = [
-        sensor.time_ns
-        for name, sensor in result.sensors.items()
-        if name == "optical" or name.startswith("marker_")
-    ]
+    seen = [result.sensors[name].time_ns for name in trackers(result.sensors)]
     if not seen:
         return []
     times = np.unique(np.concatenate(seen))

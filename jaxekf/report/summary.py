@@ -4,6 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 from jaxekf.report.evidence import Evidence
+from jaxekf.result import trackers
 
 _NAN = float("nan")
 
@@ -64,14 +65,14 @@ def summarise(seen: Evidence) -> Summary:
     """The row of one run."""
     document, score = seen.result.document, seen.score
     account, mean_nis = document["account"], document["mean_nis"]
-    trackers = [name for name in account if name == "optical" or name.startswith("marker_")]
-    known = [v for v in (mean_nis.get(name) for name in trackers) if v is not None]
+    seeing = trackers(account)
+    known = [v for v in (mean_nis.get(name) for name in seeing) if v is not None]
     return Summary(
         model=seen.result.model,
         duration_s=float(document["duration_s"]),
         samples=len(seen.result.time_ns),
-        tracker_used=sum(account[name].get("used", 0) for name in trackers),
-        tracker_read=sum(account[name].get("read", 0) for name in trackers),
+        tracker_used=sum(account[name].get("used", 0) for name in seeing),
+        tracker_read=sum(account[name].get("read", 0) for name in seeing),
         held_attitude_deg=seen.held_deg,
         attitude_rmse_deg=_NAN if score is None else score.attitude_rmse_deg,
         gyroscope_rmse_deg_s=seen.raw_rate_deg_s,

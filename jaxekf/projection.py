@@ -6,7 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 
 NEAREST = 1e-3
-"""Metres: a point that is not so far in front of the camera is projected as if it were."""
+"""Metres: a point that is not so far in front of the camera is not seen."""
+_BESIDE = 10.0
+"""Focal lengths from the axis at which such a point is said to appear: in no image."""
 _ITERATIONS = 8
 
 
@@ -30,12 +32,14 @@ def stretch(radial: Array, point: Array) -> Array:
 def project(lens: Lens, p_camera: Array) -> Array:
     """Image point (2,), pixels, of a point (3,) in the camera's frame (its z is the optical axis).
 
-    Finite, with finite derivatives, for points beside and behind the camera too; these mean nothing.
+    Points beside and behind the camera, which no image shows, appear far outside, wherever they are: with
+    derivatives 0, since slopes that mean nothing would let such a point through every gate.
     """
-    depth = p_camera[2]
-    depth = jnp.where(depth > NEAREST, depth, NEAREST)
-    point = p_camera[:2] / depth
-    return lens.focal * point * stretch(lens.radial, point) + lens.centre
+    in_front = p_camera[2] > NEAREST
+    seen = jnp.where(in_front, p_camera, jnp.array([0.0, 0.0, 1.0]))
+    point = seen[:2] / seen[2]
+    there = lens.focal * point * stretch(lens.radial, point) + lens.centre
+    return jnp.where(in_front, there, lens.focal * _BESIDE + lens.centre)
 
 
 def ray(lens: Lens, pixel: Array) -> Array:

@@ -87,6 +87,9 @@ def poses(camera: Camera) -> Resection:
     valid &= scale <= _LARGEST_ERROR * float(np.mean(camera.focal))
     valid &= counted >= np.maximum(_FEWEST_FLAT, _LEAST_SHARE * usable.sum(axis=1))
     valid &= np.isfinite(away).all(axis=1)
+    # Few points fit a pose of six numbers better than they are.
+    free = np.maximum(2 * counted - 6, 1)
+    scale = scale * np.sqrt(np.maximum(2 * counted, 1) / free)
     _, information = _solved(residual, slope, weight)
     fits = np.zeros((count, len(camera.names)), bool)
     np.put_along_axis(fits, order, (weight > 0.0) & valid[:, None], axis=1)

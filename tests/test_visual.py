@@ -14,7 +14,17 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import ekf, linalg, manifold, regions, resection, simulate, simulate_camera, timeline
+from jaxekf import (
+    ekf,
+    linalg,
+    manifold,
+    projection,
+    regions,
+    resection,
+    simulate,
+    simulate_camera,
+    timeline,
+)
 from jaxekf.cli.estimate import _row as table_row
 from jaxekf.model import Belief
 from jaxekf.models import correspondences, visual
@@ -266,8 +276,36 @@ def test_a_start_is_sought_where_a_pose_follows():
     np.testing.assert_allclose(start.first["position"], whole.position[40], atol=1e-8)
     near = slice(40, 45)
     t = (camera.time_ns[near] - camera.time_ns[40]) / 1e9
-    slope = np.polyfit(t, whole.position[near], 1)[0]
+    weight = 1.0 / correspondences._doubt(whole)[near]
+    slope = np.polyfit(t, whole.position[near], 1, w=weight)[0]
     np.testing.assert_allclose(start.first["velocity"], slope, atol=1e-6)
+
+
+def test_a_start_is_where_the_pose_is_known():
+    """Would catch a run that starts from four points which a pose far off fits as well, metres away, while
+    the gates refuse every good point thereafter."""
+    grade = CameraGrade(points=4)
+    run = camera_recording("run", seed=1, duration_s=SECONDS, grade=grade)
+    first = int(np.argmax(resection.poses(run.camera).valid))
+    made = jaxekf.estimate(run, "visual")
+    assert made.time_ns[0] > run.camera.time_ns[first]
+    position, attitude = errors(made, run)
+    assert position < 0.05
+    assert attitude < np.deg2rad(0.5)
+    assert any("tells the pose well" in note for note in made.notes)
+
+
+def test_what_lies_behind_the_camera_tells_nothing():
+    """Would catch slopes of points that no image shows, which let such a point through every gate and make
+    the covariance infinite."""
+    params = as_arrays(visual.DEFAULTS)
+    for place in ([0.1, 0.2, -0.5], [0.1, 0.2, 0.0], [0.1, 0.2, 1e-4]):
+        point, slope = (
+            f(partial(projection.project, visual.lens_of(params)))(jnp.asarray(place))
+            for f in (lambda g: g, jax.jacrev)
+        )
+        assert not np.any(slope)
+        assert np.all(np.abs(point) > 1e3)
 
 
 def test_a_point_that_no_lens_maps_is_no_point():

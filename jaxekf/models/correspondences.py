@@ -15,18 +15,23 @@ from jaxekf.recording import (
     Camera,
     Flags,
     Floats,
-    Optical,
     Recording,
     Samples,
     Times,
     to_scipy,
 )
+from jaxekf.resection import Resection
 
 _LINE_S = 0.35
 _NEAR_S = 0.1
 """An IMU sample so near to the first image tells acceleration and rate there."""
 _ENOUGH = 6
 """Landmarks from which a pose follows wherever they are."""
+START_POSITION, START_ATTITUDE = 0.05, float(np.deg2rad(1.0))
+"""Standard deviations, metres and radians, of a pose that a run starts from."""
+_PIXEL = 1.0
+_GOOD = 1.5
+"""Times as uncertain a pose may be: eight points in an image tell most poses so well, four next to none."""
 _FIRST = 16
 """Images that are solved for at first to find a start."""
 
@@ -113,8 +118,8 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     taken = stream.time_ns - stream.latency_ns
     fit = np.isin(taken, samples["camera"].time_ns)
     fit &= (taken >= imu.time_ns[0]) & (taken <= imu.time_ns[-1])
-    raw, valid = _first_poses(stream, fit)
-    if not valid.any() or raw.position is None:
+    found, first = _first_pose(stream, fit)
+    if first is None:
         enough = int((stream.usable[fit].sum(axis=1) >= _ENOUGH).sum())
         if enough:
             # Another run would not help who has named the landmarks or stated the lens wrongly.
@@ -126,51 +131,65 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
                 " landmarks' names, or their places",
             )
         return None
-    first = int(np.argmax(valid))
     known: dict[str, Any] = {
-        "position": raw.position[first],
-        "q_ref_body": raw.q_ref_body[first],
-        "velocity": _velocity(taken, raw.position, valid, first),
+        "position": found.position[first],
+        "q_ref_body": found.q_ref_body[first],
+        "velocity": _velocity(taken, found, fit, first),
     }
     near = int(np.argmin(np.abs(imu.time_ns - taken[first])))
     if abs(int(imu.time_ns[near] - taken[first])) <= _NEAR_S * NANOSECONDS:
         known["rate"] = imu.gyroscope[near]
         if imu.accelerometer is not None:
-            force = to_scipy(raw.q_ref_body[first]).apply(imu.accelerometer[near])
+            force = to_scipy(found.q_ref_body[first]).apply(imu.accelerometer[near])
             known["acceleration"] = force + inertial.gravity(
                 recording, lambda: resection.as_optical(stream)
             )
     waited = (taken[first] - taken[0]) / NANOSECONDS
     note = ""
     if waited > 0.0:
-        note = f"waited {waited:.3f} s for an image from which a pose follows, to start from"
+        note = f"waited {waited:.3f} s for an image that tells the pose well, to start from"
     return Start(int(taken[first]), known, note)
 
 
-def _first_poses(stream: Camera, fit: Flags) -> tuple[Optical, Flags]:
-    """Poses of all images, and which are known: of those that fit, up to the first from which a pose
-    follows, and as many thereafter as its velocity is found from."""
+def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
+    """Poses of images, and the first that a run can start from: of those that fit the first that is known
+    as well as `Initial` says, or the one that is known best; None where no pose follows from any. Images
+    are solved for up to there, and as many thereafter as a velocity is found from."""
     taken, count = stream.time_ns, len(stream.time_ns)
     solved = np.zeros(count, bool)
     some = _FIRST
     while True:
         solved[np.flatnonzero(fit)[:some]] = True
-        raw = resection.as_optical(replace(stream, visible=stream.visible & solved[:, None]))
-        valid = raw.valid & fit
-        if solved[fit].all():
-            return raw, valid
-        if valid.any():
-            needed = fit & (taken <= taken[np.argmax(valid)] + int(_LINE_S * NANOSECONDS))
-            if solved[needed].all():
-                return raw, valid
+        found = resection.poses(replace(stream, visible=stream.visible & solved[:, None]))
+        valid = found.valid & fit
+        doubt = np.where(valid, _doubt(found), np.inf)
+        good = np.flatnonzero(doubt <= _GOOD)
+        everything = bool(solved[fit].all())
+        if good.size:
+            first = int(good[0])
+            needed = fit & (taken <= taken[first] + int(_LINE_S * NANOSECONDS))
+            if everything or solved[needed].all():
+                return found, first
+        elif everything:
+            return found, int(np.argmin(doubt)) if valid.any() else None
         some *= 2
 
 
-def _velocity(taken: Times, position: Floats, valid: Flags, first: int) -> Floats:
+def _doubt(found: Resection) -> Floats:
+    """(N,) the largest standard deviation of poses, those of `Initial` being 1; of points that are a pixel
+    off at least, as a few fit a pose by chance."""
+    sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    chance = np.maximum(1.0, _PIXEL / np.maximum(found.error, 1e-9))
+    return chance * np.max(sigma / np.repeat([START_POSITION, START_ATTITUDE], 3), axis=1)
+
+
+def _velocity(taken: Times, found: Resection, fit: Flags, first: int) -> Floats:
     """Velocity (3,), m/s, at an image: slope of a line through the positions of the third of a second from
-    there, since those of single images are too uncertain for a difference; 0 where there is one only."""
+    there, since those of single images are too uncertain for a difference, each as it is known; 0 where
+    there is one only."""
     t = (taken - taken[first]) / NANOSECONDS
-    near = valid & (t >= 0.0) & (t <= _LINE_S)
+    near = found.valid & fit & (t >= 0.0) & (t <= _LINE_S)
     if near.sum() < 2:
         return np.zeros(3)
-    return np.polynomial.polynomial.polyfit(t[near], position[near], 1)[1]
+    weight = 1.0 / np.maximum(_doubt(found)[near], 1e-3)
+    return np.polynomial.polynomial.polyfit(t[near], found.position[near], 1, w=weight)[1]

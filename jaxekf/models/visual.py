@@ -270,10 +270,10 @@ DEFAULTS = Parameters(
         latency=np.array(0.0),
     ),
     Initial(
-        position=0.05,
+        position=correspondences.START_POSITION,
         velocity=1.0,
         acceleration=1.0,
-        attitude=np.deg2rad(1.0),
+        attitude=correspondences.START_ATTITUDE,
         rate=0.2,
         bias=np.deg2rad(1.0),
         accelerometer_bias=0.2,

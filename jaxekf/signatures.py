@@ -10,6 +10,7 @@ white, so that nothing is found.
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -77,13 +78,13 @@ def attitude_rows(estimate: Estimate, sensor: str) -> slice | None:
 
 def find_faults(estimate: Estimate, sensor: str) -> Faults | None:
     """Latency of a tracker, and bias and matrix errors of the gyroscope; None for a sensor without
-    attitude, or a model without attitude and rate.
+    attitude, or whose noise hangs on vectors read with each sample, or a model without attitude and rate.
 
     Of a smoothed estimate, which does not hold the filter's covariance, only the latency.
     """
     rows = attitude_rows(estimate, sensor)
     record = estimate.sensors[sensor]
-    if rows is None or len(record.time_ns) < 3:
+    if rows is None or len(record.time_ns) < 3 or _noise_turns(estimate, sensor):
         return None
     used = record.used[:, rows].all(axis=1)
     time_ns, cov = record.time_ns, record.cov[:, rows, rows]
@@ -116,6 +117,16 @@ def find_faults(estimate: Estimate, sensor: str) -> Faults | None:
         memory,
         judged,
     )
+
+
+def _noise_turns(estimate: Estimate, sensor: str) -> bool:
+    """Whether the noise hangs on vectors in the body, which no record keeps.
+
+    It turns with the body then, and the gain found from that of `aux_like` would be another filter's, even
+    one that runs away.
+    """
+    leaves = jax.tree.leaves(estimate.model.sensor(sensor).aux_like)
+    return any(np.ndim(leaf) > 0 for leaf in leaves)
 
 
 def _spread(values: Any, chosen: Any) -> Floats:

@@ -193,7 +193,8 @@ def judge_whiteness(times: Sequence[Times], whitened: Sequence[Floats]) -> White
     """Whitened innovations of several runs, times (N,) and values (N, rows), NaN where not used."""
     periods = [period_ns(t) for t in times if len(t) > 1]
     period = float(np.median(periods)) / NANOSECONDS if periods else 1.0
-    series = [on_grid(t, w) for t, w in zip(times, whitened, strict=True) if len(t)]
+    # Those without a sample stay: of a sensor that no run read there is no other that tells its rows.
+    series = [on_grid(t, w) for t, w in zip(times, whitened, strict=True)]
     longest = max((len(s) for s in series), default=0)
     wanted = int(np.clip(round(LONGEST_LAG_S / max(period, 1e-9)), 10, MOST_LAGS))
     lags = max(1, min(wanted, longest // 4))

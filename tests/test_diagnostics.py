@@ -10,9 +10,10 @@ from click.testing import CliRunner
 from scipy.stats import chi2, kstest
 
 import jaxekf
-from jaxekf import consistency, signatures, simulate, simulate_tool, storage
+from jaxekf import consistency, signatures, simulate, simulate_surgery, simulate_tool, storage
 from jaxekf.cli import main
 from jaxekf.datasets import demo
+from jaxekf.recording import Imu, Recording
 
 GRADES = {
     "ordinary": simulate.SensorGrade(),
@@ -211,6 +212,29 @@ def test_few_samples_give_no_verdict():
     diagnosis = jaxekf.diagnose(jaxekf.estimate(record, MODEL, small))
     assert not diagnosis.verdicts
     assert any("too few to judge" in note for note in diagnosis.notes)
+
+
+def surgery(seconds):
+    """A hand that never rests, with gyroscope, accelerometer and magnetometer; it lies on its side."""
+    array, motion = simulate_surgery.handheld_array(), simulate_surgery.surgical_motion(1)
+    made = simulate_surgery.array_run(motion, array, seed=1, duration_s=seconds)
+    force = simulate_surgery.mean_force(array, made.readings)
+    imu = Imu(made.time_ns, made.rate[:, [1, 2, 0]], force[:, [1, 2, 0]], made.field[:, [1, 2, 0]])
+    world = {"gravity_ref": [0.0, 0.0, -9.80665], "field_ref": [1.0, 0.0, 0.0]}
+    return Recording("hand", None, imu, None, world)
+
+
+@pytest.mark.parametrize("name", ["marg", "triad"])
+def test_runs_without_a_tracker_can_be_judged(name, recwarn):
+    """Would catch a sensor that has not one sample, such as rest in a run that never rests, and a gain of
+    noise that turns with the body worked out as if it did not, which ran away until it overflowed."""
+    run = surgery(6.0)
+    made = jaxekf.estimate(run, name)
+    diagnosis = jaxekf.diagnose(made, run)
+    assert set(diagnosis.sensors) == set(made.sensors)
+    assert name == "triad" or diagnosis.sensors["rest"].nis.samples == 0
+    json.dumps(diagnosis.as_dict())
+    assert not [w.message for w in recwarn if issubclass(w.category, RuntimeWarning)]
 
 
 @pytest.mark.parametrize("name", ["tight", "loose_pose", "loose_rate", "loose_additive"])

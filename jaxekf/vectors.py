@@ -119,6 +119,13 @@ def triad_covariance(
     Where `triad` is not valid for the sake of the body vectors, the identity is returned: about one
     radian, which is nothing known. The references are not looked at.
     """
+    for cov in (first_cov, second_cov):
+        # Anything else would be broadcast, to what is no covariance.
+        if jnp.shape(cov) != (3, 3):
+            raise ValueError(
+                f"got a covariance of shape {jnp.shape(cov)}, expected (3, 3); of a standard deviation it"
+                " is sigma**2 * jnp.eye(3), and for many attitudes use jax.vmap"
+            )
     dtype = float_type(first_body, second_body, first_cov, second_cov)
     (t1, t2, t3), told = _triad_axes(first_body, second_body, least_sine)
     first = jnp.where(told, jnp.asarray(first_body, dtype), t1)

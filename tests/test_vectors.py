@@ -279,3 +279,12 @@ def test_least_angle_is_a_choice():
     noise = (np.eye(3), np.eye(3))
     open_turn = covariance(*pair, *noise, least_sine=0.1)
     np.testing.assert_array_equal(open_turn, np.eye(3))
+
+
+@pytest.mark.parametrize("cov", [0.01, np.full(3, 0.01), np.full((2, 3, 3), 0.01)])
+def test_a_covariance_of_another_shape_is_refused(cov):
+    """Would catch variances that are broadcast: of 0.01 came a covariance with an eigenvalue of 0."""
+    with pytest.raises(ValueError, match="expected \\(3, 3\\)"):
+        vectors.triad_covariance(
+            np.array([0.0, 0.0, 9.8]), np.array([1.0, 0.0, 0.0]), cov, np.eye(3)
+        )

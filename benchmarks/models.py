@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from clock import timed
 from jax import Array, lax
+from textbook import correct, linearise, predict
 
-from jaxekf import jit, manifold, run_filter_batch
+from jaxekf import jit, manifold, robust, run_filter_batch
 from jaxekf.ekf import inputs_of
 from jaxekf.interpolation import InputSample
 from jaxekf.model import Belief, Model, Parameters
-from jaxekf.models import loose, marg, tight, triad
+from jaxekf.models import loose, marg, triad
 from jaxekf.timeline import Knots, Rows, Steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -26,62 +26,19 @@ import toy_models
 _RUNS, _STEPS, _DT = 64, 500, 0.01
 
 
-def _ungated(model: Model) -> Model:
-    return replace(model, sensors=tuple(replace(s, gate=None) for s in model.sensors))
-
-
 def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> tuple[Any, Array]:
     """One run of a model whose sensors are all sampled at every step, without gates."""
-    n = model.error_dim
     inputs = inputs_of(model, params, steps)
 
-    def step(carry: Any, given: Any) -> Any:
-        x, p = carry
+    def step(belief: Belief, given: Any) -> Any:
         u, dt, samples = given
-        size = model.process_noise(params, dt).shape[0]
-
-        def moved(delta: Array, w: Array) -> Any:
-            y = model.transition(manifold.retract(model.space, x, delta), u, dt, w, params)
-            return manifold.local(model.space, ahead, y)
-
-        still = jnp.zeros(size)
-        ahead = model.transition(x, u, dt, still, params)
-        f, g = jax.jacfwd(moved, (0, 1))(jnp.zeros(n), still)
-        p = f @ p @ f.T + g @ model.process_noise(params, dt) @ g.T
-        slopes, errors, noises = [], [], []
-        for name, rows in samples.items():
-            sensor = model.sensor(name)
-            expected = sensor.predict(ahead, u, params, rows.aux)
-
-            def seen(
-                delta: Array, sensor: Any = sensor, rows: Any = rows, expected: Any = expected
-            ) -> Any:
-                y = manifold.retract(model.space, ahead, delta)
-                return manifold.local(
-                    sensor.space, expected, sensor.predict(y, u, params, rows.aux)
-                )
-
-            slopes.append(jax.jacfwd(seen)(jnp.zeros(n)))
-            errors.append(manifold.local(sensor.space, expected, rows.value))
-            noises.append(sensor.noise(params, rows.aux, rows.dt))
-        h, e = jnp.concatenate(slopes), jnp.concatenate(errors)
-        r = jax.scipy.linalg.block_diag(*noises)
-        s = h @ p @ h.T + r
-        factor = jax.scipy.linalg.cho_factor(s, lower=True)
-        gain = jax.scipy.linalg.cho_solve(factor, h @ p).T
-        fit = e @ jax.scipy.linalg.cho_solve(factor, e)
-        logdet = 2.0 * jnp.sum(jnp.log(jnp.diag(factor[0])))
-        gained = -0.5 * (fit + logdet + len(e) * jnp.log(2 * jnp.pi))
-        delta = gain @ e
-        a = jnp.eye(n) - gain @ h
-        p = a @ p @ a.T + gain @ r @ gain.T
-        reset = manifold.reset_jacobian(model.space, delta)
-        p = reset @ p @ reset.T
-        x = manifold.retract(model.space, ahead, delta)
-        return (x, 0.5 * (p + p.T)), (x, gained)
+        ahead = predict(model, params, belief, u, dt)
+        h, e, r = linearise(model, params, ahead.mean, u, samples)
+        found, gained = correct(model, ahead, h, e, r, len(e))
+        return found, (found.mean, gained)
 
     given = jax.tree.map(lambda a: a[:, 0], (inputs, steps.dt, steps.fast))
-    _, (means, gained) = lax.scan(step, tuple(belief), given)
+    _, (means, gained) = lax.scan(step, belief, given)
     return means, jnp.sum(gained)
 
 
@@ -118,10 +75,10 @@ def _steps(model: Model, runs: int) -> Steps:
 
 CONTENDERS = {
     "loose": loose.MODEL,
-    "tight": _ungated(tight.MODEL),
+    "tight": robust("tight", "none"),
     "triad": triad.MODEL,
     "marg": marg.MODEL,
-    "markers": _ungated(toy_models.MARKERS),
+    "markers": robust(toy_models.MARKERS, "none"),
 }
 """Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; a toy of 15 degrees of freedom."""
 

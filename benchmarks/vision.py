@@ -8,7 +8,6 @@ under `lax.cond`), which must agree. Prints a table, and last one line of JSON.
 import argparse
 import json
 import os
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,8 +24,9 @@ from clock import timed  # noqa: E402
 from jax import Array, lax  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
+from textbook import correct, linearise, predict  # noqa: E402
 
-from jaxekf import jit, manifold, run_filter, run_smoother, timeline  # noqa: E402
+from jaxekf import jit, robust, run_filter, run_smoother, timeline  # noqa: E402
 from jaxekf.model import Belief, Model, Parameters  # noqa: E402
 from jaxekf.models import visual  # noqa: E402
 from jaxekf.parameters import as_arrays  # noqa: E402
@@ -37,68 +37,25 @@ from jaxekf.timeline import Rows, Steps  # noqa: E402
 POINTS = 30
 
 
-def _update(model: Model, params: Parameters, belief: Belief, samples: dict[str, Rows]) -> Any:
-    """The textbook's, of all rows at once; those that are masked say nothing."""
-    x, p = belief
-    n = model.error_dim
-    noises, masks, values = [], [], []
-    for name, rows in samples.items():
-        sensor = model.sensor(name)
-        one = sensor if sensor.alike is None else sensor.alike
-        blocks = jax.vmap(lambda aux, one=one, rows=rows: one.noise(params, aux, rows.dt))
-        every = rows.aux if sensor.alike is not None else jax.tree.map(lambda a: a[None], rows.aux)
-        count = sensor.rows // one.rows
-        noises += list(blocks(every)) if count > 1 else [one.noise(params, rows.aux, rows.dt)]
-        masks.append(rows.mask)
-        values.append(rows.value)
-
-    def predict(delta: Array) -> Array:
-        y = manifold.retract(model.space, x, delta)
-        said = []
-        for name, rows in samples.items():
-            said.append(model.sensor(name).predict(y, None, params, rows.aux))
-        return jnp.concatenate(said)
-
-    mask, value, zero = jnp.concatenate(masks), jnp.concatenate(values), jnp.zeros(n)
-    h = jnp.where(mask[:, None], jax.jacfwd(predict)(zero), 0.0)
-    error = jnp.where(mask, value - predict(zero), 0.0)
-    r = jnp.where(mask[:, None] & mask, jax.scipy.linalg.block_diag(*noises), 0.0)
-    r = r + jnp.diag(jnp.where(mask, 0.0, 1.0))
-    factor = jax.scipy.linalg.cho_factor(h @ p @ h.T + r, lower=True)
-    gain = jax.scipy.linalg.cho_solve(factor, h @ p).T
-    fit = error @ jax.scipy.linalg.cho_solve(factor, error)
-    logdet = 2.0 * jnp.sum(jnp.log(jnp.diag(factor[0])))
-    gained = -0.5 * (fit + logdet + jnp.sum(mask) * jnp.log(2 * jnp.pi))
-    delta = gain @ error
-    a = jnp.eye(n) - gain @ h
-    p = a @ p @ a.T + gain @ r @ gain.T
-    reset = manifold.reset_jacobian(model.space, delta)
-    return Belief(manifold.retract(model.space, x, delta), reset @ p @ reset.T), gained
-
-
 def textbook(model: Model, params: Parameters, belief: Belief, steps: Any) -> tuple[Any, Array]:
     """Updated means at every instant of `flattened` steps, and the likelihood of all samples."""
-    n = model.error_dim
+
+    def updated(samples: dict[str, Rows], ahead: Belief) -> tuple[Belief, Array]:
+        h, e, r = linearise(model, params, ahead.mean, None, samples)
+        mask = jnp.concatenate([rows.mask for rows in samples.values()])
+        # Rows that are masked say nothing.
+        h, e = jnp.where(mask[:, None], h, 0.0), jnp.where(mask, e, 0.0)
+        r = jnp.where(mask[:, None] & mask, r, jnp.diag(jnp.where(mask, 0.0, 1.0)))
+        return correct(model, ahead, h, e, r, jnp.sum(mask))
 
     def step(belief: Belief, given: Any) -> Any:
-        x, p = belief
-        valid, dt, fast, slow = given
-        q = model.process_noise(params, dt)
-        still = jnp.zeros(q.shape[0])
-        ahead = model.transition(x, None, dt, still, params)
-
-        def moved(delta: Array, w: Array) -> Array:
-            y = model.transition(manifold.retract(model.space, x, delta), None, dt, w, params)
-            return manifold.local(model.space, ahead, y)
-
-        f, g = jax.jacfwd(moved, (0, 1))(jnp.zeros(n), still)
-        there = Belief(ahead, f @ p @ f.T + g @ q @ g.T)
-        seen = jnp.stack([rows.mask.any() for rows in slow.values()]).any()
+        valid, dt, fast, camera = given
+        ahead = predict(model, params, belief, None, dt)
         found, gained = lax.cond(
-            seen,
-            lambda b: _update(model, params, b, {**fast, **slow}),
-            lambda b: _update(model, params, b, fast),
-            there,
+            camera.mask.any(),
+            partial(updated, fast | {"camera": camera}),
+            partial(updated, fast),
+            ahead,
         )
         kept = jax.tree.map(lambda a, b: jnp.where(valid, a, b), found, belief)
         return kept, (kept.mean, jnp.where(valid, gained, 0.0))
@@ -108,19 +65,17 @@ def textbook(model: Model, params: Parameters, belief: Belief, steps: Any) -> tu
 
 
 def flattened(steps: Steps) -> Any:
-    """One instant after the other; samples of the ends of epochs masked elsewhere."""
+    """One instant after the other; images, which are at the ends of epochs, masked elsewhere."""
     epochs, substeps = np.shape(steps.dt)
 
     def flat(a: Any) -> Array:
         return jnp.reshape(a, (epochs * substeps, *np.shape(a)[2:]))
 
-    def late(rows: Rows) -> Rows:
-        every = jax.tree.map(lambda a: np.repeat(np.asarray(a), substeps, axis=0), rows)
-        last = np.arange(epochs * substeps) % substeps == substeps - 1
-        return jax.tree.map(jnp.asarray, every._replace(mask=every.mask & last[:, None]))
-
-    slow = {name: late(rows) for name, rows in steps.slow.items()}
-    return flat(steps.valid), flat(steps.dt), jax.tree.map(flat, steps.fast), slow
+    images = jax.tree.map(lambda a: np.repeat(a, substeps, axis=0), steps.slow["camera"])
+    last = np.arange(epochs * substeps) % substeps == substeps - 1
+    images = images._replace(mask=images.mask & last[:, None])
+    given = (flat(steps.valid), flat(steps.dt), jax.tree.map(flat, steps.fast), images)
+    return jax.tree.map(jnp.asarray, given)
 
 
 def recorded(seconds: float) -> Recording:
@@ -131,10 +86,7 @@ def recorded(seconds: float) -> Recording:
 def race(run: Recording, least_s: float) -> dict[str, tuple[float, float]]:
     """Seconds of the first call of each, and of one like it later."""
     model = visual.adapt(False, [run])
-    ungated = tuple(
-        replace(s, gate=None, alike=s.alike and replace(s.alike, gate=None)) for s in model.sensors
-    )
-    plain = replace(model, sensors=ungated)
+    plain = robust(model, "none")
     line = timeline.build(model, run)
     given = as_arrays(model.parameters)._replace(setup=line.setup)
     steps = jax.tree.map(jnp.asarray, line.steps)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from jaxekf.projection import NEAREST
 from jaxekf.recording import Camera, Flags, Floats, Optical, from_scipy, to_scipy
 
-_FEWEST, _FEWEST_FLAT = 6, 4
+FEWEST, _FEWEST_FLAT = 6, 4
+"""Landmarks from which a pose follows wherever they are, and where they lie in one plane."""
 _SUBSETS = 24
 _ITERATIONS = 12
 _STILL = 1e-10
@@ -177,12 +178,12 @@ def _start(
         return None
     ways: list[tuple[Any, Any, int]] = []
     if axes[1][2] > _FLAT * axes[1][0]:
-        if len(place) < _FEWEST:
+        if len(place) < FEWEST:
             return None
-        ways.append((_linear, everything, _FEWEST))
+        ways.append((_linear, everything, FEWEST))
         # A few landmarks beside a plane that holds the others tell the linear transform next to nothing.
         plane = _largest_plane(place, rng)
-        if len(plane) >= _FEWEST:
+        if len(plane) >= FEWEST:
             ways.append((_homography, plane, _FEWEST_FLAT))
     else:
         ways.append((_homography, everything, _FEWEST_FLAT))

@@ -104,12 +104,7 @@ def test_both_forms_agree():
 
 def drawn(count, seconds, keep="everything", **changes):
     """Runs drawn from the model itself, along the eight, and what the filter makes of them."""
-    model = visual.for_points(POINTS)
-    sensors = tuple(
-        replace(s, gate=None, alike=None if s.alike is None else replace(s.alike, gate=None))
-        for s in model.sensors
-    )
-    model = replace(model, sensors=sensors)
+    model = jaxekf.robust(visual.for_points(POINTS), "none")
     recording = camera_recording("run", seed=5, duration_s=seconds, grade=few())
     line = timeline.build(model, recording)
     params = as_arrays(model.parameters)._replace(setup=line.setup)

@@ -25,11 +25,10 @@ from jaxekf.resection import Resection
 _LINE_S = 0.35
 _NEAR_S = 0.1
 """An IMU sample so near to the first image tells acceleration and rate there."""
-_ENOUGH = 6
-"""Landmarks from which a pose follows wherever they are."""
 START_POSITION, START_ATTITUDE = 0.05, float(np.deg2rad(1.0))
 """Standard deviations, metres and radians, of a pose that a run starts from."""
 _PIXEL = 1.0
+"""Noise of image points that is expected at least when a pose is chosen to start from."""
 _GOOD = 1.5
 """Times as uncertain a pose may be: eight points in an image tell most poses so well, four next to none."""
 _FIRST = 16
@@ -120,12 +119,12 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     fit &= (taken >= imu.time_ns[0]) & (taken <= imu.time_ns[-1])
     found, first = _first_pose(stream, fit)
     if first is None:
-        enough = int((stream.usable[fit].sum(axis=1) >= _ENOUGH).sum())
+        enough = int((stream.usable[fit].sum(axis=1) >= resection.FEWEST).sum())
         if enough:
             # Another run would not help who has named the landmarks or stated the lens wrongly.
             raise RecordingError(
                 recording.path or recording.name,
-                f"{enough} images of {_ENOUGH} landmarks or more, none of which fits any pose",
+                f"{enough} images of {resection.FEWEST} landmarks or more, none of which fits any pose",
                 "points that lie where the landmarks appear",
                 "correcting the camera's focal, centre and radial (in pixels of these images), the"
                 " landmarks' names, or their places",

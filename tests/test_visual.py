@@ -290,6 +290,23 @@ def test_a_start_is_where_the_pose_is_known():
     assert any("tells the pose well" in note for note in made.notes)
 
 
+def test_a_start_does_not_wait_for_the_best_image():
+    """Would catch a run of poor images of which most is lost before the one that tells its pose best."""
+    run = camera_recording("run", seed=0, duration_s=6.0, grade=few(pixel=6.0))
+    camera = run.camera
+    found = resection.poses(camera)
+    doubt = np.where(found.valid, correspondences._doubt(found), np.inf)
+    assert np.argmin(doubt) > 50
+    start = correspondences.find_start(run, {"camera": correspondences.camera(8, False, run)})
+    first = int(np.flatnonzero(camera.time_ns == start.time_ns)[0])
+    assert first < 30
+    assert doubt[first] < 3.0 < np.median(doubt)
+    # Of images of which none is known well, the first of those that are known alike.
+    early = np.arange(len(doubt)) < 12
+    _, first = correspondences._first_pose(camera, early)
+    assert first == np.argmax(doubt <= 1.5 * doubt[early].min()) < np.argmin(doubt[early])
+
+
 def test_what_lies_behind_the_camera_tells_nothing():
     """Would catch slopes of points that no image shows, which let such a point through every gate and make
     the covariance infinite."""

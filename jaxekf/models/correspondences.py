@@ -30,7 +30,12 @@ START_POSITION, START_ATTITUDE = 0.05, float(np.deg2rad(1.0))
 _PIXEL = 1.0
 """Noise of image points that is expected at least when a pose is chosen to start from."""
 _GOOD = 1.5
-"""Times as uncertain a pose may be: eight points in an image tell most poses so well, four next to none."""
+"""Times as uncertain as that a pose may be: eight points tell most poses so well, four next to none. Where
+no pose is known so well, times as uncertain as the best."""
+_PATIENCE_S = 5.0
+"""The time after which twice that will do, and so on, as what goes before the start is lost. Of images of
+fewer than `_SURE` points no less will do, since they fit poses far off by chance."""
+_SURE = resection.FEWEST
 _FIRST = 16
 """Images that are solved for at first to find a start."""
 
@@ -152,17 +157,21 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
 
 def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
     """Poses of images, and the first that a run can start from: of those that fit the first that is known
-    as well as `Initial` says, or the one that is known best; None where no pose follows from any. Images
-    are solved for up to there, and as many thereafter as a velocity is found from."""
+    as well as `Initial` says, less well the longer it takes, or nearly as well as any; None where no pose
+    follows from any. Images are solved for up to there, and as many thereafter as a velocity is found
+    from."""
     taken, count = stream.time_ns, len(stream.time_ns)
     solved = np.zeros(count, bool)
+    waited = np.maximum(taken - taken[np.argmax(fit)], 0) / NANOSECONDS if count else np.zeros(0)
+    sure = stream.usable.sum(axis=1) >= _SURE
+    will_do = _GOOD * np.where(sure, 1.0 + waited / _PATIENCE_S, 1.0)
     some = _FIRST
     while True:
         solved[np.flatnonzero(fit)[:some]] = True
         found = resection.poses(replace(stream, visible=stream.visible & solved[:, None]))
         valid = found.valid & fit
         doubt = np.where(valid, _doubt(found), np.inf)
-        good = np.flatnonzero(doubt <= _GOOD)
+        good = np.flatnonzero(doubt <= will_do)
         everything = bool(solved[fit].all())
         if good.size:
             first = int(good[0])
@@ -170,7 +179,9 @@ def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
             if everything or solved[needed].all():
                 return found, first
         elif everything:
-            return found, int(np.argmin(doubt)) if valid.any() else None
+            if not valid.any():
+                return found, None
+            return found, int(np.argmax(doubt <= np.where(sure, _GOOD, 1.0) * doubt.min()))
         some *= 2
 
 

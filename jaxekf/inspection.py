@@ -6,6 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf.alignment import RunAlignment, align_run, drifts
+from jaxekf.camera_evidence import (
+    CameraEvidence,
+    camera_evidence,
+    camera_warnings,
+    check_camera,
+)
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import overlap_s
 from jaxekf.plausible import Evidence, check, evidence
@@ -95,6 +101,8 @@ class Inspection:
     """Single markers by their names."""
     points: PointsFound | None = None
     """None without a camera."""
+    camera: CameraEvidence | None = None
+    """None also where no image has landmarks enough for a pose."""
 
     @property
     def verdict(self) -> str:
@@ -115,12 +123,17 @@ def inspect(recording: Recording) -> Inspection:
         check(recording, found)
     except RecordingError as error:
         faults.append(str(error))
-    aligned = None
+    aligned, seen = None, camera_evidence(recording)
+    if seen is not None and not faults:
+        try:
+            check_camera(recording, seen)
+        except RecordingError as error:
+            faults.append(str(error))
     tracked = recording.optical is not None or recording.markers is not None
-    if recording.imu is None or not tracked:
+    if recording.imu is None or not (tracked or seen is not None):
         lacking = "IMU" if recording.imu is None else "tracker"
         notes.append(f"without {lacking} neither clocks nor units can be compared")
-    elif not faults:
+    elif tracked and not faults:
         try:
             aligned = align_run(recording)
         except RecordingError as error:
@@ -130,6 +143,7 @@ def inspect(recording: Recording) -> Inspection:
     warnings += _of_time(streams, found)
     warnings += [] if aligned is None else _of_clocks(aligned)
     warnings += [] if faults else _of_units(recording, found)
+    warnings += [] if faults or seen is None else camera_warnings(seen)
     return Inspection(
         recording.name,
         streams,
@@ -140,6 +154,7 @@ def inspect(recording: Recording) -> Inspection:
         tuple(notes),
         _markers(recording),
         _points(recording),
+        seen,
     )
 
 

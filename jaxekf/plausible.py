@@ -31,7 +31,8 @@ _POOR, _BETTER = 0.95, 4.0
 """Share of turning that a wrong reading does not explain, and by how much less a right one leaves: noise
 leaves the same in every reading, so that a factor is no chance."""
 _TWO_AXES = 0.05
-_LEAST_RATE = np.deg2rad(2.0)
+LEAST_RATE = np.deg2rad(2.0)
+"""rad/s: of slower turning noise decides how alike it is."""
 _LEAST_ACCELERATION = 0.1
 _NEARBY, _FAR = 0.02, 20.0
 """Metres: no tracker has its tool always as near as the first, or as far as the second."""
@@ -56,11 +57,9 @@ def check(recording: Recording, found: Evidence) -> None:
             raise _apart(recording, found, label)
     _check_truth(recording)
     force = _force(recording, found)
-    rate = None
-    if found.rate > _LEAST_RATE and found.rate_correlation > ALIKE:
-        rate = _unit(found.rate_ratio, DEGREES, _CLOSE, ("deg/s", "rad/s"))
+    rate = rates_unit(found)
     if rate is not None:
-        raise _fault(
+        raise fault(
             recording,
             "imu.unit",
             f"a gyroscope that turns {found.rate_ratio:.4g} times as fast as the tracker (correlation"
@@ -72,6 +71,28 @@ def check(recording: Recording, found: Evidence) -> None:
         raise force[1]
     _check_length(recording, found)
     _check_order(recording, found)
+
+
+def rates_unit(found: Evidence) -> str | None:
+    """The gyroscope's unit to state instead; None where turning does not tell that another is meant."""
+    if not (found.rate > LEAST_RATE and found.rate_correlation > ALIKE):
+        return None
+    return _unit(found.rate_ratio, DEGREES, _CLOSE, ("deg/s", "rad/s"))
+
+
+def path_unit(found: Evidence) -> str | None:
+    """The unit of positions to state instead; None where the accelerometer does not tell that another is
+    meant."""
+    if not found.length_correlation > ALIKE:
+        return None
+    unit = _unit(found.length_ratio, THOUSAND, _NEAR, ("mm", "m"))
+    if unit is None:
+        return None
+    if found.acceleration < _LEAST_ACCELERATION * (THOUSAND if unit == "mm" else 1.0 / THOUSAND):
+        return None
+    if found.farthest > _NEARBY if unit == "m" else found.farthest < _FAR:
+        return None
+    return unit
 
 
 def _unit(ratio: float, factor: float, within: float, names: tuple[str, str]) -> str | None:
@@ -97,39 +118,36 @@ def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] 
         got = f"an accelerometer whose readings average {norm:.2g} m/s^2 in the tracker's frame"
     if norm < _REMOVED_BELOW:
         hint = "recording with gravity in it, or leaving out the columns ax, ay, az"
-        error = _fault(recording, "imu.unit", got, f"{expected}: gravity is removed", hint)
+        error = fault(recording, "imu.unit", got, f"{expected}: gravity is removed", hint)
         return "m/s^2", error
     for unit, size in (("g", 1.0), ("m/s^2", _STANDARD**2), ("mm/s^2", 1e3 * _STANDARD)):
         if abs(norm / size - 1.0) < _G_WITHIN:
             hint = f'[imu] unit = "rad/s, {unit}"'
-            return unit, _fault(recording, "imu.unit", got, expected, hint)
+            return unit, fault(recording, "imu.unit", got, expected, hint)
     return None
 
 
 def _check_length(recording: Recording, found: Evidence) -> None:
     """Millimetres taken for metres, or the other way round."""
-    if not found.length_correlation > ALIKE:
-        return
-    unit = _unit(found.length_ratio, THOUSAND, _NEAR, ("mm", "m"))
-    if unit is None:
-        return
     if recording.optical is None:
+        unit = _unit(found.length_ratio, THOUSAND, _NEAR, ("mm", "m"))
+        if unit is None:
+            return
         stated = recording.info.get("markers_about", {}).get("unit", "m")
         hint = f'[markers] unit = "{unit}"'
         if stated == unit:
             hint = "[markers.geometry] in metres"
-        raise _fault(
+        raise fault(
             recording,
             "markers.unit",
             f"markers {found.length_ratio:.4g} times as far apart as in the geometry",
             "the same distances",
             hint,
         )
-    if found.acceleration < _LEAST_ACCELERATION * (THOUSAND if unit == "mm" else 1.0 / THOUSAND):
+    unit = path_unit(found)
+    if unit is None:
         return
-    if found.farthest > _NEARBY if unit == "m" else found.farthest < _FAR:
-        return
-    raise _fault(
+    raise fault(
         recording,
         "optical.unit",
         f"a tracker that moves {found.length_ratio:.4g} times as far as the accelerometer (correlation"
@@ -147,7 +165,7 @@ def _check_order(recording: Recording, found: Evidence) -> None:
         for name, made in found.readings.items()
         if made.share > EXPLAINED and left > _BETTER * (1.0 - made.share)
     }
-    enough = found.second_axis > _TWO_AXES and found.rate > _LEAST_RATE
+    enough = found.second_axis > _TWO_AXES and found.rate > LEAST_RATE
     if not fits or not enough or not found.explained < _POOR:
         return
     # By turns alone the one is the other with the frames aligned otherwise: the smaller turn between the
@@ -159,7 +177,7 @@ def _check_order(recording: Recording, found: Evidence) -> None:
         angles = " and ".join(f"{np.rad2deg(fits[name].angle):.0f}" for name in names)
         also = f", which turn the IMU's axes by {angles} deg against the tool's"
     about = recording.info.get("optical_about", {}).get("quaternion", BODY_TO_REFERENCE)
-    raise _fault(
+    raise fault(
         recording,
         "optical.quaternion",
         f"quaternions of which, as '{about}', the gyroscope explains"
@@ -207,7 +225,7 @@ def _seconds(value: float) -> str:
     return f"{value:.3f}"
 
 
-def _fault(recording: Recording, entry: str, got: str, expected: str, hint: str) -> RecordingError:
+def fault(recording: Recording, entry: str, got: str, expected: str, hint: str) -> RecordingError:
     """A fault of what `recording.toml` says, or of a run that has none."""
     place: Any = recording.path or recording.name
     column = None

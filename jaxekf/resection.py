@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf.errors import RecordingError
 from jaxekf.projection import NEAREST
 from jaxekf.recording import Camera, Flags, Floats, Optical, from_scipy, to_scipy
 
@@ -108,6 +109,17 @@ def _among_all(found: Resection, images: Any, count: int) -> Resection:
         whole[images] = value
         every.append(whole)
     return Resection(*every)
+
+
+def no_pose(place: object, images: int) -> RecordingError:
+    """The error of a camera whose lens or landmarks are wrong: another run would not help."""
+    return RecordingError(
+        place,
+        f"{images} images of {FEWEST} landmarks or more, none of which fits any pose",
+        "points that lie where the landmarks appear",
+        "correcting the camera's focal, centre and radial (in pixels of these images), the landmarks'"
+        " names, or their places",
+    )
 
 
 def as_optical(camera: Camera) -> Optical:

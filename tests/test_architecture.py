@@ -42,6 +42,7 @@ ORDER = [
     ),
     ("containers",),
     ("alignment", "plausible"),
+    ("camera_evidence",),
     ("inspection",),
     ("interpolation", "padding", "linearise", "programs", "kernels", "reverse_only"),
     ("graph", "lanes", "blocks", "epochs", "many"),

@@ -15,6 +15,7 @@ from jaxekf.inspection import find_gaps, inspect
 from jaxekf.plots.timeaxis import time_axis
 from jaxekf.recording import Camera
 from jaxekf.rows import Intake, Reason
+from jaxekf.simulate_camera import CameraGrade, camera_recording
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 
@@ -155,6 +156,87 @@ def test_a_camera(tmp_path):
     )
     moved = replace(made.camera, time_ns=made.camera.time_ns + 9_000_000_000)
     assert "camera and IMU overlap for 3.0 s" in inspect(made.replace(camera=moved)).warnings[0]
+
+
+CAMERA_FAULTS = {
+    # What is changed of the camera: what is said, and whether the run can be used nevertheless.
+    "focal in mm": (lambda c: {"focal": np.full(2, 3.2)}, "none of which fits any pose", "faults"),
+    "names": (
+        lambda c: {"p_ref_landmark": np.roll(c.p_ref_landmark, 7, axis=0)},
+        "none of which fits any pose",
+        "faults",
+    ),
+    "landmarks in mm": (
+        lambda c: {"p_ref_landmark": 1e3 * c.p_ref_landmark},
+        'stating [camera] unit = "mm, px"',
+        "faults",
+    ),
+    "scale": (lambda c: {"p_ref_landmark": 1.3 * c.p_ref_landmark}, "places to scale", "warnings"),
+    "images of half the size": (
+        lambda c: {"pixel": 0.5 * c.pixel},
+        "of the camera's turning: are both of one run",
+        "warnings",
+    ),
+    "late": (lambda c: {"time_ns": c.time_ns + 40_000_000}, "the images are 40.", "warnings"),
+    "turned": (
+        lambda c: {"q_body_camera": np.full(4, 0.5)},
+        "the camera is turned by 120.",
+        "warnings",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def eight():
+    """A camera and an IMU that draw the eight."""
+    return camera_recording("eight", seed=2, duration_s=30.0)
+
+
+def test_a_camera_as_it_should_be(eight, tmp_path):
+    """Would catch warnings of a good camera, or clocks and lengths that are compared and not shown."""
+    path = storage.save(eight, tmp_path / "eight")
+    done = run_check(path, "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    told = " ".join(done.stdout.split())
+    assert "376 of 376 images looked at fit a pose, points 0.6" in told
+    assert "camera, rate: the gyroscope turns 1.0" in told
+    document = json.loads((tmp_path / "out" / "check.json").read_text())["runs"][0]
+    found = document["streams"]["camera"]
+    assert abs(found["alignment"]["latency_s"]) < 3e-3
+    assert found["evidence"]["length_ratio"] == pytest.approx(1.0, abs=0.1)
+    few = camera_recording("few", seed=3, duration_s=30.0, grade=CameraGrade(points=6))
+    assert inspect(few).warnings == ()
+
+
+@pytest.mark.parametrize("change", CAMERA_FAULTS)
+def test_gross_faults_of_a_camera(eight, change):
+    """Would catch a lens, places or a clock that are wrong by far and called fine."""
+    changes, said, verdict = CAMERA_FAULTS[change]
+    found = inspect(eight.replace(camera=replace(eight.camera, **changes(eight.camera))))
+    assert found.verdict == verdict
+    texts = found.faults if verdict == "faults" else found.warnings
+    assert any(said in text for text in texts), texts
+
+
+def test_a_gyroscope_in_degrees_beside_a_camera(eight):
+    """Would catch a unit that only a tracker is compared for."""
+    imu = replace(eight.imu, gyroscope=np.rad2deg(eight.imu.gyroscope))
+    (said,) = inspect(eight.replace(imu=imu)).faults
+    assert "as fast as the camera" in said and 'unit = "deg/s' in said
+
+
+def test_a_tracker_of_12_5_hz_is_compared():
+    """Would catch steps of which two are longer than the span that turns are taken over: nothing told."""
+    run = free(0)
+    every = round(0.08 / np.median(np.diff(run.optical.time_ns / 1e9)))
+    parts = {"time_ns": run.optical.time_ns[::every]}
+    for key in run.optical.per_sample:
+        value = getattr(run.optical, key)
+        parts[key] = None if value is None else value[::every]
+    optical = replace(run.optical, **parts)
+    step = np.median(np.diff(optical.time_ns)) / 1e9
+    assert 0.075 < step < 0.1
+    assert inspect(run.replace(optical=optical)).evidence.turns > 40
 
 
 def test_what_is_warned_of():

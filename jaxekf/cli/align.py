@@ -154,13 +154,14 @@ def _pm(value: float, sigma: float) -> str:
 
 def run_document(run: RunAlignment) -> dict[str, Any]:
     """One run for JSON."""
-    document: dict[str, Any] = {"run": run.run, "tracker": _aligned(run.tracker)}
+    document: dict[str, Any] = {"run": run.run, "tracker": match_document(run.tracker)}
     if run.encoder is not None:
-        document["encoder"] = _aligned(run.encoder)
+        document["encoder"] = match_document(run.encoder)
     return document | {"notes": list(run.notes)}
 
 
-def _aligned(made: AttitudeMatch) -> dict[str, Any]:
+def match_document(made: AttitudeMatch) -> dict[str, Any]:
+    """One stream of a run for JSON."""
     return {
         "latency_s": made.latency_s,
         "latency_sigma_s": made.latency_sigma_s,

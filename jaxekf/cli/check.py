@@ -2,13 +2,15 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import click
+import numpy as np
 
 from jaxekf import storage
-from jaxekf.cli.align import aligned_row, alignment_columns, run_document
+from jaxekf.cli.align import aligned_row, alignment_columns, match_document, run_document
 from jaxekf.cli.console import (
     json_option,
     note,
@@ -123,6 +125,10 @@ def _document(one: Checked) -> dict[str, Any]:
         streams["markers"]["each"] = singles
     if found.points is not None:
         streams["camera"] |= found.points._asdict()
+    if found.camera is not None:
+        streams["camera"] |= found.camera.as_dict()
+        if found.camera.match is not None:
+            streams["camera"]["alignment"] = match_document(found.camera.match)
     aligned = None if found.alignment is None else run_document(found.alignment)
     return document | {
         "run": found.run,
@@ -150,11 +156,7 @@ def _tell(one: Checked, *, tables: bool) -> None:
     columns = ["stream", "samples", "usable", "rate\n(Hz)", "from\n(s)", "lasts\n(s)"]
     columns += ["gaps", "longest\n(s)", "lost\n(s)", "hidden\n(s)", "dropped"]
     print_table(found.run, columns, [_row(label, told) for label, told in streams.items()])
-    if found.alignment is not None:
-        made = found.alignment
-        rows = [aligned_row(made.run, "tracker", made.tracker)]
-        if made.encoder is not None:
-            rows.append(aligned_row(made.run, "encoder", made.encoder))
+    if rows := _aligned(found):
         columns = alignment_columns()[1:]
         print_table("Against the IMU, with standard deviations", columns, [r[1:] for r in rows])
     for text in (*_points(found), *_evidence(found.evidence)):
@@ -182,28 +184,47 @@ def _row(label: str, told: StreamFound) -> list[Any]:
     ]
 
 
+def _aligned(found: Inspection) -> list[list[Any]]:
+    """What lies in time and frame against the IMU."""
+    rows, made = [], found.alignment
+    if made is not None:
+        rows.append(aligned_row(found.run, "tracker", made.tracker))
+        if made.encoder is not None:
+            rows.append(aligned_row(found.run, "encoder", made.encoder))
+    if found.camera is not None and found.camera.match is not None:
+        rows.append(aligned_row(found.run, "camera", found.camera.match))
+    return rows
+
+
 def _points(found: Inspection) -> list[str]:
-    """How much a camera saw."""
-    made = found.points
+    """How much a camera saw, and whether it fits."""
+    made, seen = found.points, found.camera
     if made is None:
         return []
-    return [
+    lines = [
         f"camera: {made.points_per_image:.1f} of {made.landmarks} landmarks in an image on average,"
         f" {made.images_without_points} of {made.images} images without any"
     ]
+    if seen is None or seen.posed == 0:
+        return lines
+    told = f"camera: {seen.posed} of {seen.images} images looked at fit a pose, points"
+    lines.append(f"{told} {seen.error_px:.2f} pixels about it")
+    for text in _evidence(replace(seen.imu, static_norm=np.nan), "camera"):
+        lines.append(text if text.startswith("camera") else f"camera, {text}")
+    return lines
 
 
-def _evidence(found: Evidence) -> list[str]:
-    """What speaks for units and order."""
+def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
+    """What speaks for units and order; of a camera its poses have no order that could be another."""
     lines = []
     if found.rate_ratio == found.rate_ratio:
         lines.append(
-            f"rate: the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker (correlation"
+            f"rate: the gyroscope turns {found.rate_ratio:.3f} times as fast as the {tracker} (correlation"
             f" {found.rate_correlation:.2f})"
         )
     elif found.turns:
         lines.append("rate: too little turning, or too unlike, to tell the gyroscope's unit")
-    if found.readings:
+    if found.readings and tracker == "tracker":
         others = max(made.share for made in found.readings.values())
         lines.append(
             f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"
@@ -212,8 +233,10 @@ def _evidence(found: Evidence) -> list[str]:
     if found.static_norm == found.static_norm:
         lines.append(f"accelerometer: {found.static_norm:.2f} m/s^2 in the quietest seconds")
     if found.length_ratio == found.length_ratio:
-        what = "path: the tracker moves {:.3f} times as far as the accelerometer"
+        what = (
+            f"path: the {tracker} moves {found.length_ratio:.3f} times as far as the accelerometer"
+        )
         if not found.readings:
-            what = "markers: {:.3f} times as far apart as in the geometry"
-        lines.append(what.format(found.length_ratio))
+            what = f"markers: {found.length_ratio:.3f} times as far apart as in the geometry"
+        lines.append(what)
     return lines

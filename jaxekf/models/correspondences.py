@@ -126,14 +126,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     if first is None:
         enough = int((stream.usable[fit].sum(axis=1) >= resection.FEWEST).sum())
         if enough:
-            # Another run would not help who has named the landmarks or stated the lens wrongly.
-            raise RecordingError(
-                recording.path or recording.name,
-                f"{enough} images of {resection.FEWEST} landmarks or more, none of which fits any pose",
-                "points that lie where the landmarks appear",
-                "correcting the camera's focal, centre and radial (in pixels of these images), the"
-                " landmarks' names, or their places",
-            )
+            raise resection.no_pose(recording.path or recording.name, enough)
         return None
     known: dict[str, Any] = {
         "position": found.position[first],

@@ -14,7 +14,7 @@ from jaxekf.alignment import align
 from jaxekf.attitude_match import AttitudeMatch
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import ALIKE, Evidence, evidence
-from jaxekf.plausible import LEAST_RATE, fault, path_unit, rates_unit
+from jaxekf.plausible import LEAST_RATE, check_gravity, fault, path_unit, rates_unit
 from jaxekf.recording import Camera, Flags, Optical, Recording
 
 _MOST_IMAGES, _TRIED = 1500, 60
@@ -124,6 +124,7 @@ def check_camera(recording: Recording, found: CameraEvidence) -> None:
             "the same rate",
             f'[imu] unit = "{unit}, m/s^2", the accelerometer\'s as it is',
         )
+    check_gravity(recording, imu)
     unit = path_unit(imu)
     if unit is not None:
         raise fault(

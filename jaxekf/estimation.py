@@ -221,8 +221,8 @@ def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
     raise FilterError(
         f"run '{line.name}': got a covariance that is not finite and definite at step {k * substeps + s},"
         f" {seconds:.6f} s, {blamed} of model"
-        f" '{model.name}', expected a definite one; look for wrong units in the data or noise that is"
-        " zero, negative or not finite"
+        f" '{model.name}', expected a definite one; look for noise that is zero, negative or not finite, or"
+        " for units, gravity_ref or frames that are not as stated (jaxekf check names what it can tell)"
     )
 
 

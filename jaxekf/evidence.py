@@ -51,8 +51,8 @@ class Evidence:
     """The accelerometer's in the quietest seconds, m/s^2."""
     static_scatter: float = np.nan
     """Deviation of that norm over it."""
-    mean_force: float = np.nan
-    """Norm of the mean of the accelerometer's readings in the reference frame, m/s^2, of any motion."""
+    mean_force_ref: tuple[float, ...] = (np.nan, np.nan, np.nan)
+    """Mean of the accelerometer's readings in the reference frame, m/s^2, of any motion."""
     length_ratio: float = np.nan
     """The tracker's acceleration to the accelerometer's, or the markers' distances to the geometry's."""
     length_correlation: float = np.nan
@@ -65,6 +65,11 @@ class Evidence:
     """First and last time of each stream, latency taken off, s."""
     overlap_s: float = np.nan
     """Of tracker and IMU; negative where one ends before the other begins."""
+
+    @property
+    def mean_force(self) -> float:
+        """Norm of `mean_force_ref`."""
+        return float(np.linalg.norm(self.mean_force_ref))
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; angles in degrees."""
@@ -80,6 +85,7 @@ class Evidence:
             "explained_otherwise": told,
             "static_norm": self.static_norm,
             "mean_force": self.mean_force,
+            "mean_force_ref": list(self.mean_force_ref),
             "length_ratio": self.length_ratio,
             "length_correlation": self.length_correlation,
             "ranges_s": {name: list(ends) for name, ends in self.ranges_s.items()},
@@ -122,7 +128,7 @@ def evidence(recording: Recording) -> Evidence:
         "readings": others,
     }
     if stated.share > EXPLAINED:
-        told["mean_force"] = likeness.mean_force(made, imu, stated.frame)
+        told["mean_force_ref"] = tuple(likeness.mean_force(made, imu, stated.frame).tolist())
     if isinstance(tracker, Optical):
         told |= _lengths(tracker, imu, made, stated)
     return Evidence(**told)

@@ -251,15 +251,15 @@ def distance(optical: Optical, imu: Imu, lag_s: float, frame: Floats) -> Distanc
     return _compared(swung, force)
 
 
-def mean_force(made: Turns, imu: Imu, frame: Floats) -> float:
-    """Norm of the mean of the accelerometer's readings in the reference frame, m/s^2: gravity's, whatever
-    the motion. NaN without an accelerometer."""
+def mean_force(made: Turns, imu: Imu, frame: Floats) -> Floats:
+    """Mean of the accelerometer's readings (3,) in the reference frame, m/s^2: opposite to free fall,
+    whatever the motion. NaN without an accelerometer."""
     if imu.accelerometer is None:
-        return np.nan
+        return np.full(3, np.nan)
     integral = Integral(imu.time_ns, imu.accelerometer)
     width = 0.05
     force = integral.between(made.at - width, made.at + width) / (2.0 * width)
-    return float(np.linalg.norm(rotate(made.begin, force @ frame.T).mean(axis=0)))
+    return rotate(made.begin, force @ frame.T).mean(axis=0)
 
 
 def _compared(swung: Floats, force: Floats) -> Distance:

@@ -39,6 +39,7 @@ _NEARBY, _FAR = 0.02, 20.0
 _STANDARD = 9.80665
 _G_WITHIN, _REMOVED_BELOW = 0.15, 0.5
 _STEADY = 0.15
+_SIZE_OFF, _TURNED = 0.5, np.deg2rad(30.0)
 
 
 def require(recording: Recording) -> None:
@@ -71,6 +72,7 @@ def check(recording: Recording, found: Evidence) -> None:
         raise force[1]
     _check_length(recording, found)
     _check_order(recording, found)
+    check_gravity(recording, found)
 
 
 def rates_unit(found: Evidence) -> str | None:
@@ -125,6 +127,30 @@ def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] 
             hint = f'[imu] unit = "rad/s, {unit}"'
             return unit, fault(recording, "imu.unit", got, expected, hint)
     return None
+
+
+def check_gravity(recording: Recording, found: Evidence) -> None:
+    """Raise `RecordingError` where the accelerometer contradicts the `gravity_ref` that a run states: it is
+    of another size, the other way round, or along another axis."""
+    stated = recording.info.get("gravity_ref")
+    if stated is None:
+        return
+    size, norm = float(np.linalg.norm(stated)), found.static_norm
+    plain = found.static_scatter < _STEADY and 0.5 < norm / _STANDARD < 2.0
+    if plain and abs(norm / max(size, 1e-12) - 1.0) > _SIZE_OFF:
+        got, expected = f"free fall of {size:.3g} m/s^2", f"about {norm:.3g}, as at rest"
+    elif abs(found.mean_force / max(size, 1e-12) - 1.0) < _SIZE_OFF:
+        fall = -np.asarray(found.mean_force_ref)
+        angle = np.arccos(np.clip(fall @ np.asarray(stated) / (found.mean_force * size), -1.0, 1.0))
+        if angle < _TURNED:
+            return
+        near = f"[{', '.join(f'{value:.1f}' for value in fall)}]"
+        got = f"free fall that is {np.rad2deg(angle):.0f} deg off what the accelerometer says"
+        expected = f"about {near} m/s^2 in the reference frame (what falls accelerates downwards)"
+    else:
+        return
+    also = ", or the direction of the quaternions" if recording.optical is not None else ""
+    raise fault(recording, "gravity_ref", got, expected, f"correcting gravity_ref{also}")
 
 
 def _check_length(recording: Recording, found: Evidence) -> None:

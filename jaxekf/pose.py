@@ -195,7 +195,7 @@ def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
             str(place),
             f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from",
             "one, or gravity_ref = [x, y, z] in recording.toml",
-            "stating gravity in the tracker's frame",
+            "stating free fall in the reference frame of the poses",
         )
     return total / lasted
 

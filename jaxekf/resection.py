@@ -5,6 +5,9 @@ where that does not fit from random small subsets, so that mismatches do not dec
 error is least is then refined by Gauss and Newton on the manifold, points that are far off counting less.
 """
 
+import weakref
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,8 +60,34 @@ class Resection(NamedTuple):
     """(N, L) points that fit the pose."""
 
 
-def poses(camera: Camera) -> Resection:
-    """The pose of every image from at least six landmarks, or four that lie in one plane."""
+def poses(camera: Camera, most: int | None = None) -> Resection:
+    """The pose of every image from at least six landmarks, or four that lie in one plane; of every n-th
+    image alone, the rest not valid, where there are more than `most`.
+
+    Kept as long as the camera is: gravity, the start and figures all ask for it.
+    """
+    if (found := solved(camera)) is not None:
+        return found
+    every = 1 if most is None else max(1, -(-len(camera.time_ns) // most))
+    key = id(camera), every
+    if key not in _KEPT:
+        shown = np.arange(len(camera.time_ns)) % every == 0
+        found = _poses(replace(camera, visible=camera.visible & shown[:, None]))
+        # An id may be another camera's once this one is gone.
+        _KEPT[key] = weakref.ref(camera, lambda _: _KEPT.pop(key, None)), found
+    return _KEPT[key][1]
+
+
+def solved(camera: Camera) -> Resection | None:
+    """The poses of all images where they were solved for before."""
+    kept = _KEPT.get((id(camera), 1))
+    return None if kept is None else kept[1]
+
+
+_KEPT: dict[tuple[int, int], tuple[weakref.ref[Camera], Resection]] = {}
+
+
+def _poses(camera: Camera) -> Resection:
     images = np.flatnonzero(camera.usable.sum(axis=1) >= _FEWEST_FLAT)
     points, order = _points(camera, images)
     direction = _directions(points)
@@ -111,7 +140,7 @@ def _among_all(found: Resection, images: Any, count: int) -> Resection:
     return Resection(*every)
 
 
-def no_pose(place: object, images: int) -> RecordingError:
+def no_pose(place: Path | str, images: int) -> RecordingError:
     """The error of a camera whose lens or landmarks are wrong: another run would not help."""
     return RecordingError(
         place,

@@ -112,18 +112,25 @@ def build(
     of a model whose steps are those of one stream (`Model.hold_to`).
     """
     samples = {s.name: _read(s, recording) for s in model.sensors}
-    driver = None
+    driver, counted = None, dict(samples)
     if model.input is not None:
-        driver = _check_input(model.input.source(recording), recording, model.input.name)
+        counted[model.input.name] = model.input.source(recording)
+        driver = _check_input(counted[model.input.name], recording, model.input.name)
     start, end, found = _span(model, recording, samples, driver)
-    counted = dict(samples)
-    if driver is not None and model.input is not None:
-        counted[model.input.name] = driver
     account = {
         name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
         for name, stream in counted.items()
     }
     samples = {name: cut(stream, start, end) for name, stream in samples.items()}
+    for name, stream in samples.items():
+        if len(stream.time_ns) == 0:
+            raise RecordingError(
+                recording.path or recording.name,
+                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, where"
+                f" the run of model '{model.name}' lies",
+                "at least one",
+                "streams that overlap, or a model without that sensor",
+            )
     if model.hold_to is not None:
         samples = hold(samples, model.hold_to, account)
     events = [stream.time_ns for stream in samples.values()]

@@ -159,7 +159,8 @@ def judge_sensor(
                 sensor,
                 nis,
                 f"{sensor} noise is set too large by {1 / nis.factor:.2f}x (deviation): lower it or"
-                f" tune it{_by_row(labels, white)}",
+                " tune it, or the process noise where that is the larger part of what is said"
+                f"{_by_row(labels, white)}",
             )
         )
     return found

@@ -225,6 +225,12 @@ def test_a_gyroscope_in_degrees_beside_a_camera(eight):
     assert "as fast as the camera" in said and 'unit = "deg/s' in said
 
 
+def test_gravity_the_other_way_round_beside_a_camera(eight):
+    """Would catch gravity_ref that points up, of a run whose only poses are those of images."""
+    (said,) = inspect(eight.replace(info={"gravity_ref": [9.81, 0.0, 0.0]})).faults
+    assert "free fall that is 1" in said and "expected about [-9.9" in said
+
+
 def test_a_tracker_of_12_5_hz_is_compared():
     """Would catch steps of which two are longer than the span that turns are taken over: nothing told."""
     run = free(0)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import metrics, simulate, truth, vectors
+from jaxekf import metrics, plots, simulate, truth, vectors
 from jaxekf.errors import RecordingError
 from jaxekf.interpolation import InputSample
 from jaxekf.models import earth, marg, triad
@@ -208,3 +208,45 @@ def test_no_start_without_two_directions(runs):
     steep = run.replace(info={**run.info, "field_ref": [0.0, 0.0, -1.0]})
     with pytest.raises(RecordingError, match=r"field_ref.*horizontal"):
         jaxekf.estimate(steep, "triad")
+
+
+def test_figures_without_a_tracker(found, runs, tmp_path):
+    """Would catch models of which nothing is drawn, or whose figures need what a run has not."""
+    run = runs[0].replace(optical=None)
+    names = plots.possible_figures(found[0], run)
+    assert {"attitude", "rate", "bias"} <= set(names) and "occlusion" not in names
+    for name in names:
+        for seen in (run, run.replace(encoder=None)):
+            plots.save(plots.figure_functions()[name](found[0], seen), tmp_path / f"{name}.png")
+
+
+def test_a_gyroscope_that_breaks_off(runs):
+    """Would catch a rate that is not finite in a prediction, which makes all that follows so."""
+    run = runs[0]
+    imu = run.need_imu()
+    rate = imu.gyroscope.copy()
+    rate[1000:1003] = np.nan
+    broken = run.replace(imu=replace(imu, gyroscope=rate))
+    for model in ("triad", "marg"):
+        made, whole = (jaxekf.estimate(r, model) for r in (broken, run))
+        if model == "triad":
+            assert made.account["gyroscope"]["masked"] == 3
+        assert np.isfinite(made.attitude.value).all()
+        ends = [e.attitude.value[-1] for e in (made, whole)]
+        assert abs(ends[0] @ ends[1]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_too_little_to_tell_an_attitude(runs):
+    """Would catch a sampling period of 0, whose noise is infinite, and what the IMU of another time or of
+    other samples reads beside the field."""
+    run = runs[0]
+    imu = run.need_imu()
+    one = replace(imu, **{k: getattr(imu, k)[:1] for k in ("time_ns", *imu.per_sample)})
+    rate = imu.gyroscope.copy()
+    rate[::2] = np.nan
+    field = imu.magnetometer.copy()
+    field[1::2] = np.nan
+    for changed in (one, replace(imu, gyroscope=rate, magnetometer=field)):
+        for model in ("triad", "marg"):
+            with pytest.raises(RecordingError, match="samples of finite rate and specific force"):
+                jaxekf.estimate(run.replace(imu=changed, encoder=None), model)

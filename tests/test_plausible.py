@@ -192,6 +192,31 @@ def test_one_axis_does_not_tell_the_order():
     assert plausible.evidence(run).second_axis < 0.05
 
 
+def test_gravity_the_other_way_round():
+    """Would catch gravity_ref that is what an accelerometer at rest reads, of another axis or in g, which a
+    filter takes for an acceleration; or a true one, a few degrees off, that is refused."""
+    run = tool_pose(3)
+    assert "gravity_ref" in run.info
+    fall = np.asarray(run.info["gravity_ref"])
+
+    def require(gravity):
+        plausible.require(run.replace(info={**run.info, "gravity_ref": list(gravity)}))
+
+    require(fall)
+    require(Rotation.from_rotvec([0.3, 0.0, 0.0]).apply(fall))
+    for wrong, said in ((-fall, "1[78]. deg off"), (np.roll(fall, 1), "[89]. deg off")):
+        with pytest.raises(RecordingError, match=f"{said}.*in the reference frame.*gravity_ref"):
+            require(wrong)
+    still = scaled(run, rate=0.0)
+    still = still.replace(
+        optical=None,
+        imu=replace(still.imu, accelerometer=np.tile(-fall, (len(run.imu.time_ns), 1))),
+    )
+    for size, said in ((1.0 / 9.80665, "free fall of 1 m/s"), (1e3, "free fall of 9.8")):
+        with pytest.raises(RecordingError, match=f"{said}.*about 9.8"):
+            plausible.require(still.replace(info={"gravity_ref": list(size * fall)}))
+
+
 def test_what_is_missing_is_not_judged():
     """A crash on a run without IMU, tracker, position or accelerometer, or of a few samples."""
     run = tool_pose(0)

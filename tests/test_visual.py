@@ -18,6 +18,7 @@ from jaxekf import (
     ekf,
     linalg,
     manifold,
+    plots,
     projection,
     regions,
     resection,
@@ -29,6 +30,7 @@ from jaxekf.cli.estimate import _row as table_row
 from jaxekf.model import Belief
 from jaxekf.models import correspondences, visual
 from jaxekf.parameters import as_arrays
+from jaxekf.plots import sight
 from jaxekf.recording import from_scipy, to_scipy
 from jaxekf.simulate_camera import CameraGrade, camera_recording
 from jaxekf.truth import encoder_at
@@ -342,6 +344,46 @@ def test_a_point_that_no_lens_maps_is_no_point():
     point = camera.pixel.copy()
     point[image] = 1e300
     assert resection.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
+
+
+def test_figures_of_a_camera(tmp_path):
+    """Would catch a camera whose runs have no pictures, or poses of thinned images taken for gaps."""
+    blind = ((1.5, 2.0),)
+    run = camera_recording("run", seed=2, duration_s=SECONDS, grade=few(), blind=blind)
+    made = jaxekf.estimate(run, "visual")
+    names = plots.possible_figures(made, run)
+    assert names == ("attitude", "position", "velocity", "rate", "bias", "occlusion", "path")
+    for name in names:
+        figure = plots.figure_functions()[name](made, run)
+        plots.save(figure, tmp_path / f"{name}.png")
+        said = [
+            text.get_text() for text in (figure.legends or [figure.axes[0].get_legend()])[0].texts
+        ]
+        if name in ("attitude", "position", "path"):
+            assert "pose of an image" in said
+        if name not in ("path", "occlusion"):
+            assert "no landmark" in said
+    begin, end = plots.longest_gap(run, made)
+    assert end - begin == pytest.approx(0.5, abs=0.1)
+    whole = sight.look(made, run)
+    thin = run.replace(camera=replace(run.camera))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sight, "_MOST_IMAGES", 20)
+        shown = sight.look(made, thin)
+        assert plots.longest_gap(thin, made) == (begin, end)
+    assert 0 < len(shown.t) <= 20 < len(whole.t)
+    assert (shown.lost, shown.blind) == (whole.lost, whole.blind)
+
+
+def test_poses_are_kept_with_their_camera():
+    """Would catch images solved again for every figure, and poses of a camera that is gone given to another
+    at the same place in memory."""
+    camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
+    found = resection.poses(camera)
+    assert resection.poses(camera) is found and resection.solved(camera) is found
+    kept = len(resection._KEPT)
+    del camera
+    assert len(resection._KEPT) == kept - 1
 
 
 def test_tables_count_a_camera_as_the_tracker():

@@ -83,7 +83,7 @@ def plot(
     for made, recording in zip(estimates, recordings, strict=True):
         names = figures or plots.possible_figures(made, recording)
         if not names:
-            note(f"{made.run}: no figure: it needs samples of a tracker and ten instants or more")
+            note(f"{made.run}: no figure: it needs ten instants or more")
         drawn = draw(made, recording, output, names)
         files += drawn
         for file in drawn:

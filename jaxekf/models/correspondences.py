@@ -160,8 +160,12 @@ def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
     will_do = _GOOD * np.where(sure, 1.0 + waited / _PATIENCE_S, 1.0)
     some = _FIRST
     while True:
+        found = resection.solved(stream)
         solved[np.flatnonzero(fit)[:some]] = True
-        found = resection.poses(replace(stream, visible=stream.visible & solved[:, None]))
+        if found is None:
+            found = resection.poses(replace(stream, visible=stream.visible & solved[:, None]))
+        else:
+            solved[:] = True
         valid = found.valid & fit
         doubt = np.where(valid, _doubt(found), np.inf)
         good = np.flatnonzero(doubt <= will_do)

@@ -20,6 +20,7 @@ from jaxekf.rows import Indices
 
 GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 1.0, 0.0)
+_FEWEST = 2
 MOST_HZ = 100.0
 """Samples of a magnetometer that are used in a second: what is wrong with the field lasts longer."""
 _PAUSE_NS = 500_000_000
@@ -51,6 +52,9 @@ def need_both(recording: Recording) -> Imu:
     Raises `RecordingError`, which says which of its sensors is not there: one that reads zeros only is not.
     """
     imu = recording.need_imu()
+    finite = np.isfinite(imu.gyroscope).all(axis=1)
+    if imu.accelerometer is not None:
+        finite &= np.isfinite(imu.accelerometer).all(axis=1)
     for name, columns in (("accelerometer", "ax,ay,az"), ("magnetometer", "mx,my,mz")):
         values = getattr(imu, name)
         if values is None or not (np.isfinite(values).all(axis=1) & values.any(axis=1)).any():
@@ -60,8 +64,16 @@ def need_both(recording: Recording) -> Imu:
                 "gyroscope, accelerometer and magnetometer for this model",
                 f"adding {columns} to imu.csv, or the model loose where there is a tracker",
             )
-    assert imu.accelerometer is not None
-    finite = np.isfinite(imu.gyroscope).all(axis=1) & np.isfinite(imu.accelerometer).all(axis=1)
+    assert imu.magnetometer is not None
+    told = np.isfinite(imu.magnetometer).all(axis=1) & imu.magnetometer.any(axis=1)
+    if finite.sum() < _FEWEST or not (told & finite).any():
+        raise RecordingError(
+            recording.path or recording.name,
+            f"{int(finite.sum())} samples of finite rate and specific force,"
+            f" {int((told & finite).sum())} of them with a magnetic field",
+            f"{_FEWEST} or more, and a field in one of them",
+            "a run whose sensors were read together",
+        )
     if finite.all():
         return imu
     left = {key: getattr(imu, key)[finite] for key in imu.per_sample}

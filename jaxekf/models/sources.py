@@ -34,10 +34,10 @@ def single_markers(recording: Recording) -> Markers:
 
 
 def gyroscope(recording: Recording) -> Samples:
-    """The gyroscope's rate (N, 3), rad/s, body frame."""
+    """The gyroscope's rate (N, 3), rad/s, body frame; samples that are not finite are masked."""
     imu = recording.need_imu()
-    every = np.ones(len(imu.time_ns), bool)
-    return Samples(imu.time_ns, imu.gyroscope, every, origin=("imu",))
+    finite = np.asarray(np.isfinite(imu.gyroscope).all(axis=1))
+    return Samples(imu.time_ns, imu.gyroscope, finite, origin=("imu",))
 
 
 def imu(recording: Recording) -> Samples:

@@ -12,7 +12,7 @@ from jaxekf import manifold
 from jaxekf.plots.attitudes import attitude, euler_sigma_deg, occlusion
 from jaxekf.plots.biases import bias
 from jaxekf.plots.paths import path
-from jaxekf.plots.sight import longest_gap
+from jaxekf.plots.sight import longest_gap, look
 from jaxekf.plots.single_markers import innovations, marker_sensors, visibility
 from jaxekf.plots.style import ESTIMATE, MEASURED, STYLE, TRUTH, band, save
 from jaxekf.plots.vectors import position, rate, velocity
@@ -51,10 +51,13 @@ def figure_functions() -> dict[str, Callable[[Estimate, Recording], Figure]]:
 
 
 def possible_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...]:
-    """Names of the figures that this model and recording can show; none without a tracker's samples."""
-    tracked = recording.optical is not None or recording.markers is not None
-    if not tracked or len(estimate.time_ns) < _LEAST_INSTANTS:
+    """Names of the figures that this model and recording can show; none of fewer than ten instants."""
+    if len(estimate.time_ns) < _LEAST_INSTANTS:
         return ()
+    trackers = (recording.optical, recording.markers, recording.camera)
+    tracked = (
+        any(stream is not None for stream in trackers) and look(estimate, recording).t.size > 0
+    )
     parts = {part.name for part in manifold.parts(estimate.model.space)}
     single = bool(marker_sensors(estimate, recording))
     needs = {
@@ -63,7 +66,7 @@ def possible_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...
         "velocity": "velocity" in estimate.outputs,
         "rate": "rate" in estimate.outputs and recording.imu is not None,
         "bias": "bias" in parts and recording.imu is not None,
-        "occlusion": "attitude" in estimate.outputs,
+        "occlusion": tracked and "attitude" in estimate.outputs,
         "path": "position" in estimate.outputs
         or ("attitude" in estimate.outputs and "marker_body" in recording.info),
         "visibility": single,

@@ -25,6 +25,11 @@ from jaxekf.streams import fill_gaps
 from jaxekf.truth import encoder_at
 
 _ANGLES = ("roll", "pitch", "yaw")
+_POSE = {
+    "tracker": "pose from the tracker",
+    "pose of the markers": "pose of the markers",
+    "pose of an image": "pose from an image",
+}
 
 
 def euler_deg(q: Floats) -> Floats:
@@ -58,7 +63,8 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
         for i, name in enumerate(_ANGLES):
             axes = grid[i, 0]
             shade(axes, sight)
-            axes.plot(sight.t, measured[:, i], ".", ms=2.5, color=MEASURED, label=sight.label)
+            if sight.t.size:
+                axes.plot(sight.t, measured[:, i], ".", ms=2.5, color=MEASURED, label=sight.label)
             if known is not None:
                 angles = same_turn(known.q_ref_body, t, t, estimated)
                 angles[~known.valid] = np.nan
@@ -68,7 +74,7 @@ def attitude(estimate: Estimate, recording: Recording) -> Figure:
             axes.set_ylabel(f"{name} (deg)")
         if known is not None:
             _errors(grid[:, 1], estimate, recording, sight, known)
-        finish(figure, grid, f"{estimate.run}: attitude of the body in the tracker's frame")
+        finish(figure, grid, f"{estimate.run}: attitude of the body in {sight.frame}")
     return figure
 
 
@@ -77,6 +83,8 @@ def same_turn(q: Floats, t: Floats, t_near: Floats, near: Floats) -> Floats:
 
     Unwrapping by itself may take another turn wherever samples are missing.
     """
+    if len(q) == 0:
+        return np.zeros((0, 3))
     angles = np.rad2deg(to_scipy(q).as_euler("ZYX")[:, ::-1])
     there = np.stack([np.interp(t, t_near, near[:, i]) for i in range(3)], axis=1)
     return angles + 360.0 * np.round((there - angles) / 360.0)
@@ -86,18 +94,21 @@ def _errors(
     column: Any, estimate: Estimate, recording: Recording, sight: Sight, known: Encoder
 ) -> None:
     """Rotation vectors from the truth to the estimate and to what was measured, about the body's axes."""
-    there = encoder_at(recording.need_encoder(), sight.pose.time_ns[sight.seen])
-    measured = np.rad2deg(attitude_error(there.q_ref_body, sight.pose.q_ref_body[sight.seen]))
-    measured[~there.valid] = np.nan
+    measured = np.zeros((0, 3))
+    if sight.t.size:
+        there = encoder_at(recording.need_encoder(), sight.pose.time_ns[sight.seen])
+        measured = np.rad2deg(attitude_error(there.q_ref_body, sight.pose.q_ref_body[sight.seen]))
+        measured[~there.valid] = np.nan
     error = np.rad2deg(attitude_error(known.q_ref_body, estimate.attitude.value))
     error[~known.valid] = np.nan
     sigma = np.rad2deg(estimate.attitude.sigma)
     for i, axis in enumerate(AXES):
         axes = column[i]
         shade(axes, sight)
-        axes.plot(
-            sight.t, measured[:, i], ".", ms=2.5, color=MEASURED, alpha=0.6, label=sight.label
-        )
+        if sight.t.size:
+            axes.plot(
+                sight.t, measured[:, i], ".", ms=2.5, color=MEASURED, alpha=0.6, label=sight.label
+            )
         band(axes, estimate.time, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
         axes.plot(estimate.time, error[:, i], color=ESTIMATE, lw=1, label="estimate")
         axes.set_ylabel(f"error about {axis} (deg)")
@@ -141,7 +152,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
                 _hold(axes, t_held, hold_error[:, i])
                 _close_error(axes, estimate, known, near, i)
                 _say_worst(axes, hold_error[:, i])
-        title = f"{estimate.run}: no pose from the tracker for {span[1] - span[0]:.2f} s"
+        title = f"{estimate.run}: no {_POSE[sight.label]} for {span[1] - span[0]:.2f} s"
         finish(figure, grid, title)
     return figure
 
@@ -151,7 +162,7 @@ def _within(t: Floats, span: Stretch) -> Flags:
 
 
 def _hold(axes: Any, t: Floats, values: Floats) -> None:
-    axes.step(t, values, where="post", color=HELD, lw=1, label="tracker held")
+    axes.step(t, values, where="post", color=HELD, lw=1, label="last pose held")
 
 
 def _close_error(axes: Any, estimate: Estimate, known: Encoder, near: Flags, i: int) -> None:

@@ -64,7 +64,8 @@ def _turning(
     def turned(q: Floats) -> Floats:
         return 1e3 * to_scipy(q).apply(marker)
 
-    measured, true, optical = turned(sight.pose.q_ref_body[sight.seen]), None, recording.optical
+    true, optical = None, recording.optical
+    measured = turned(sight.pose.q_ref_body[sight.seen]) if sight.t.size else None
     if optical is not None and optical.position is not None:
         measured = 1e3 * optical.position[sight.seen]
     if known is not None:

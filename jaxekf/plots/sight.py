@@ -1,4 +1,4 @@
-"""What the tracker saw of a run, and when it saw nothing: measurements and shading of the figures.
+"""What tracker or camera saw of a run, and when it saw nothing: measurements and shading of the figures.
 
 Everything stands at the time it was taken, as the estimate does, and not when it arrived.
 """
@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf import pose
+from jaxekf import pose, resection
 from jaxekf.recording import (
     NANOSECONDS,
+    Camera,
     Encoder,
     Flags,
     Floats,
@@ -25,10 +26,12 @@ from jaxekf.result import Estimated
 from jaxekf.truth import encoder_at
 
 Stretch = tuple[float, float]
+_MOST_IMAGES = 3000
+"""More poses than a figure can show are not solved for."""
 
 
 class Sight(NamedTuple):
-    """The tracker's own view of a run."""
+    """The tracker's or the camera's own view of a run; nothing is seen of a run without either."""
 
     pose: Optical
     """The raw pose, without any filter, of the body's origin; valid where there is one."""
@@ -36,11 +39,17 @@ class Sight(NamedTuple):
     """(N,) poses that are valid and not before the estimate begins."""
     t: Floats
     """Seconds since the estimate's first instant, of the poses seen."""
+    known: Floats
+    """The same of all poses, those included that were not solved for."""
     label: str
     lost: list[Stretch]
     """Begin and end, in seconds, of what is longer than two periods without a pose."""
     blind: list[Stretch]
-    """Of what is without any marker."""
+    """Of what is without any marker or landmark."""
+    words: tuple[str, str] = ("tracker hidden", "")
+    """For what is lost and what is blind."""
+    frame: str = "the tracker's frame"
+    """That poses are in."""
 
 
 def seconds(time_ns: Times, estimate: Estimated) -> Floats:
@@ -56,18 +65,40 @@ def truth(estimate: Estimated, recording: Recording) -> Encoder | None:
 
 
 def look(estimate: Estimated, recording: Recording) -> Sight:
-    """What the tracker saw: its poses, or those of the markers where there are only those."""
-    optical, markers = recording.optical, recording.markers
-    raw, label = optical, "tracker"
-    if raw is None:
-        raw, label = pose.from_markers(recording.need_markers()), "pose of the markers"
-    raw = at_origin(raw)
+    """What the tracker saw: its poses, or those of markers or images where there are only those."""
+    optical, markers, camera = recording.optical, recording.markers, recording.camera
+    if optical is not None:
+        return _sight(estimate, at_origin(optical), "tracker")
+    if markers is not None:
+        found = _sight(estimate, at_origin(pose.from_markers(markers)), "pose of the markers")
+        blind = _gaps(found.pose.time_ns, np.asarray(markers.usable.any(axis=1)), estimate)
+        return found._replace(blind=blind, words=("fewer than 3 markers", "no marker"))
+    if camera is not None:
+        return _of_images(estimate, camera)
+    nothing = Optical(np.zeros(0, np.int64), np.zeros((0, 4)), np.zeros(0, bool))
+    return _sight(estimate, nothing, "")._replace(lost=[], frame="the reference frame")
+
+
+def _sight(estimate: Estimated, raw: Optical, label: str) -> Sight:
     seen = raw.valid & (raw.time_ns >= estimate.time_ns[0])
-    blind: list[Stretch] = []
-    if optical is None and markers is not None:
-        blind = _gaps(raw.time_ns, np.asarray(markers.usable.any(axis=1)), estimate)
     lost = _gaps(raw.time_ns, raw.valid, estimate)
-    return Sight(raw, seen, seconds(raw.time_ns[seen], estimate), label, lost, blind)
+    t = seconds(raw.time_ns[seen], estimate)
+    return Sight(raw, seen, t, t, label, lost, [])
+
+
+def _of_images(estimate: Estimated, camera: Camera) -> Sight:
+    """Poses of some images, of each by itself; what is lost is told by all of them."""
+    found = resection.poses(camera, _MOST_IMAGES)
+    taken = camera.time_ns - camera.latency_ns
+    raw = Optical(taken, found.q_ref_body, found.valid, found.position)
+    enough = np.asarray(camera.usable.sum(axis=1) >= resection.FEWEST)
+    return _sight(estimate, raw, "pose of an image")._replace(
+        known=seconds(taken[enough & (taken >= estimate.time_ns[0])], estimate),
+        lost=_gaps(taken, enough, estimate),
+        blind=_gaps(taken, np.asarray(camera.usable.any(axis=1)), estimate),
+        words=(f"fewer than {resection.FEWEST} landmarks", "no landmark"),
+        frame="the scene",
+    )
 
 
 def at_origin(raw: Optical) -> Optical:
@@ -90,10 +121,9 @@ def _gaps(time_ns: Times, seen: Flags, estimate: Estimated) -> list[Stretch]:
 
 def shade(axes: Any, sight: Sight) -> None:
     """Grey where there is no pose, darker where no marker at all is seen."""
-    words = "fewer than 3 markers" if sight.label != "tracker" else "tracker hidden"
     for stretches, colour, label in (
-        (sight.lost, "0.90", words),
-        (sight.blind, "0.78", "no marker"),
+        (sight.lost, "0.90", sight.words[0]),
+        (sight.blind, "0.78", sight.words[1]),
     ):
         for i, (begin, end) in enumerate(stretches):
             axes.axvspan(begin, end, color=colour, lw=0, zorder=0, label=label if i == 0 else None)
@@ -101,7 +131,7 @@ def shade(axes: Any, sight: Sight) -> None:
 
 def longest_gap(recording: Recording, estimate: Estimated) -> Stretch:
     """Start and end, in seconds since the start of the estimate, of the longest time without a pose."""
-    t, end = look(estimate, recording).t, float(estimate.time[-1])
+    t, end = look(estimate, recording).known, float(estimate.time[-1])
     t = np.append(t[t < end], end)
     if len(t) < 2:
         return 0.0, end

@@ -89,9 +89,7 @@ def position(estimate: Estimate, recording: Recording) -> Figure:
         None if known is None else _known_mm(known),
         measured,
     )
-    return _draw(
-        estimate, sight, vector, f"{estimate.run}: position of the body in the tracker's frame"
-    )
+    return _draw(estimate, sight, vector, f"{estimate.run}: position of the body in {sight.frame}")
 
 
 def velocity(estimate: Estimate, recording: Recording) -> Figure:
@@ -107,8 +105,9 @@ def velocity(estimate: Estimate, recording: Recording) -> Figure:
         known,
         None,
     )
-    title = f"{estimate.run}: velocity of the body in the tracker's frame"
-    return _draw(estimate, look(estimate, recording), vector, title)
+    sight = look(estimate, recording)
+    title = f"{estimate.run}: velocity of the body in {sight.frame}"
+    return _draw(estimate, sight, vector, title)
 
 
 def _known_mm(encoder: Encoder) -> Floats | None:

@@ -45,8 +45,9 @@ def gather(result: SavedResult) -> Evidence:
     """
     recording, missing = _load(result)
     sight = None
-    if recording is not None and (recording.optical is not None or recording.markers is not None):
+    if recording is not None:
         sight = look(result, recording)
+        sight = sight if sight.label else None
     lost = _unseen(result) if sight is None else sight.lost
     score, held, raw, errors = None, _NAN, _NAN, {}
     if recording is not None and recording.encoder is not None:

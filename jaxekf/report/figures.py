@@ -106,10 +106,15 @@ def attitude(seen: Evidence, bins: int) -> Figure | None:
         measured,
     )
     caption = (
-        "Turns about z, y and x (yaw, pitch, roll) from the tracker's frame to the body. Errors are"
+        f"Turns about z, y and x (yaw, pitch, roll) from {_frame(seen)} to the body. Errors are"
         " rotation vectors about the body's axes, estimate less encoder."
     )
     return Figure("attitude", "Attitude", caption, _vector(seen, vector, bins))
+
+
+def _frame(seen: Evidence) -> str:
+    """In words, what attitudes and positions are told in."""
+    return "the reference frame" if seen.sight is None else seen.sight.frame
 
 
 def rate(seen: Evidence, bins: int) -> Figure | None:
@@ -158,7 +163,7 @@ def position(seen: Evidence, bins: int) -> Figure | None:
         measured = _Measured(sight.t, raw, off, sight.label, True)
     sigma = 1e3 * output.sigma
     vector = _Vector(AXES, "mm", 1e3 * output.value, sigma, true, error, sigma, measured)
-    caption = "Position of the body's origin in the tracker's frame."
+    caption = f"Position of the body's origin in {_frame(seen)}."
     return Figure("position", "Position", caption, _vector(seen, vector, bins))
 
 
@@ -174,7 +179,7 @@ def velocity(seen: Evidence, bins: int) -> Figure | None:
         error = 1e3 * output.value - true
     sigma = 1e3 * output.sigma
     vector = _Vector(AXES, "mm/s", 1e3 * output.value, sigma, true, error, sigma, None)
-    caption = "Velocity of the body's origin in the tracker's frame."
+    caption = f"Velocity of the body's origin in {_frame(seen)}."
     return Figure("velocity", "Velocity", caption, _vector(seen, vector, bins))
 
 
@@ -239,9 +244,8 @@ def _timed(seen: Evidence) -> Column:
 
 
 def shade(grid: Grid, seen: Evidence) -> None:
-    """Grey where there is no pose of the tracker."""
-    single = seen.sight is not None and seen.sight.label != "tracker"
-    grid.shade(seen.lost, "fewer than 3 markers" if single else "tracker hidden")
+    """Grey where there is no pose of tracker or camera."""
+    grid.shade(seen.lost, "tracker hidden" if seen.sight is None else seen.sight.words[0])
 
 
 def _vector(seen: Evidence, vector: _Vector, bins: int) -> dict[str, Any]:

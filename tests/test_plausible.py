@@ -12,6 +12,7 @@ from jaxekf.datasets import asl, broad
 from jaxekf.errors import RecordingError
 from jaxekf.pose import from_markers
 from jaxekf.recording import from_scipy, to_scipy
+from jaxekf.truth import encoder_at
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
@@ -190,6 +191,25 @@ def test_one_axis_does_not_tell_the_order():
     run = simulate.recording("run", simulate.constant_rate_motion(), seed=0, duration_s=30.0)
     plausible.require(turned(run, lambda q: q * CONJUGATE))
     assert plausible.evidence(run).second_axis < 0.05
+
+
+def test_one_axis_does_not_tell_where_gravity_is():
+    """Would catch a direction made up about the one axis that a tool on a spindle turns about."""
+    run = simulate.recording("run", simulate.constant_rate_motion(), seed=0, duration_s=30.0)
+    tilt = Rotation.from_euler("y", 90.0, degrees=True)
+    there = tilt * to_scipy(encoder_at(run.encoder, run.imu.time_ns).q_ref_body)
+    about = Rotation.from_euler("z", 180.0, degrees=True)  # how the IMU lies on the spindle
+    force = about.apply(there.inv().apply([0.0, 0.0, 9.81]))
+    optical = replace(run.optical, q_ref_body=from_scipy(tilt * to_scipy(run.optical.q_ref_body)))
+    spindle = run.replace(
+        optical=optical,
+        encoder=None,
+        imu=replace(run.imu, gyroscope=about.apply(run.imu.gyroscope), accelerometer=force),
+        info={"gravity_ref": [0.0, 0.0, -9.81]},
+    )
+    found = plausible.evidence(spindle)
+    assert found.explained > 0.95 and found.mean_force > 5.0
+    plausible.require(spindle)
 
 
 def test_gravity_the_other_way_round():

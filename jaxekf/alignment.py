@@ -17,6 +17,8 @@ from jaxekf.synchronise import match
 _DRIFTS = 3.0
 """Deviations from which on a drift is believed."""
 _MATTERS_S = 1e-3
+_LATE_S, _SIGMAS = 2e-3, 3.0
+_TURNED = np.deg2rad(1.0)
 _KNOWN = np.deg2rad(0.5)
 _AGREE = 0.01
 
@@ -106,6 +108,20 @@ def align_run(recording: Recording) -> RunAlignment:
 def align(optical: Optical, imu: Imu, place: object = "recording") -> AttitudeMatch:
     """Clock, drift and frame of one stream of attitudes. Raises `RecordingError`: see `match`, `refine`."""
     return refine(optical, imu, match(optical, imu, place), place)
+
+
+def is_late(found: AttitudeMatch) -> bool:
+    """Whether a latency is there, for certain, that matters."""
+    return abs(found.latency_s) > max(_LATE_S, _SIGMAS * found.latency_sigma_s)
+
+
+def turned_deg(found: AttitudeMatch) -> tuple[float, float] | None:
+    """By how many degrees the frames are turned, and the largest deviation; None where they may be one."""
+    angle = float(np.linalg.norm(found.alignment))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(found.alignment_cov)[-1]))
+    if angle <= max(_TURNED, _SIGMAS * sigma):
+        return None
+    return float(np.rad2deg(angle)), float(np.rad2deg(sigma))
 
 
 def drifts(found: AttitudeMatch) -> bool:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf import resection
-from jaxekf.alignment import align
+from jaxekf.alignment import align, is_late, turned_deg
 from jaxekf.attitude_match import AttitudeMatch
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import ALIKE, Evidence, evidence
-from jaxekf.plausible import LEAST_RATE, check_gravity, fault, path_unit, rates_unit
+from jaxekf.plausible import FARTHEST_M, LEAST_RATE, check_gravity, fault, path_unit, rates_unit
 from jaxekf.recording import Camera, Flags, Optical, Recording
 
 _MOST_IMAGES, _TRIED = 1500, 60
@@ -25,8 +25,6 @@ _PIXELS, _TIMES = 3.0, 2.0
 """Points off by so much, and by so many of their reported deviations, are not found badly but placed."""
 _RATE_OFF, _LENGTH_OFF = 0.05, 0.2
 _EXPLAINED = 0.5
-_LATE_S, _TURNED, _SIGMAS = 2e-3, np.deg2rad(1.0), 3.0
-_FARTHEST_M = 20.0
 
 
 class CameraEvidence(NamedTuple):
@@ -167,7 +165,7 @@ def camera_warnings(found: CameraEvidence) -> list[str]:
             f"the camera moves {imu.length_ratio:.3g} times as far as the accelerometer: are the landmarks'"
             " places to scale?"
         )
-    if imu.farthest > _FARTHEST_M:
+    if imu.farthest > FARTHEST_M:
         warnings.append(
             f"the camera is up to {imu.farthest:.3g} m from the scene's origin: are the landmarks' places"
             " in metres?"
@@ -177,16 +175,14 @@ def camera_warnings(found: CameraEvidence) -> list[str]:
 
 def _of_match(made: AttitudeMatch) -> list[str]:
     warnings = []
-    if abs(made.latency_s) > max(_LATE_S, _SIGMAS * made.latency_sigma_s):
+    if is_late(made):
         warnings.append(
             f"the images are {1e3 * made.latency_s:.1f} ± {1e3 * made.latency_sigma_s:.1f} ms older than"
             " stamped, by the IMU's clock: state [camera] latency, or tune calibration.latency"
         )
-    angle = float(np.linalg.norm(made.alignment))
-    sigma = float(np.sqrt(np.linalg.eigvalsh(made.alignment_cov)[-1]))
-    if angle > max(_TURNED, _SIGMAS * sigma):
+    if (turned := turned_deg(made)) is not None:
         warnings.append(
-            f"the camera is turned by {np.rad2deg(angle):.1f} ± {np.rad2deg(sigma):.1f} deg against where"
+            f"the camera is turned by {turned[0]:.1f} ± {turned[1]:.1f} deg against where"
             " q_body_camera says: correct it, or tune calibration.alignment"
         )
     return warnings

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf.alignment import RunAlignment, align_run, drifts
+from jaxekf.alignment import RunAlignment, align_run, drifts, is_late, turned_deg
 from jaxekf.camera_evidence import (
     CameraEvidence,
     camera_evidence,
@@ -14,16 +14,13 @@ from jaxekf.camera_evidence import (
 )
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import overlap_s
-from jaxekf.plausible import Evidence, check, evidence
+from jaxekf.plausible import FARTHEST_M, Evidence, check, evidence
 from jaxekf.recording import NANOSECONDS, STREAMS, Flags, Recording, Times
 
 GAP = 1.5
 """Median steps from which on a step is a gap."""
 _LONG_IMU_GAP_S = 0.5
-_LATE_S, _SIGMAS = 2e-3, 3.0
-_TURNED = np.deg2rad(1.0)
 _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
-_FARTHEST_M = 20.0
 _STANDARD = 9.80665
 _SEEN_TOO_LITTLE = 0.5
 _EXPECTED = ("blank", "hidden", "missing tool", "status ")
@@ -276,16 +273,14 @@ def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
 def _of_clocks(aligned: RunAlignment) -> list[str]:
     made = aligned.tracker
     warnings = list(aligned.notes)
-    if abs(made.latency_s) > max(_LATE_S, _SIGMAS * made.latency_sigma_s) and not drifts(made):
+    if is_late(made) and not drifts(made):
         warnings.append(
             f"the tracker's samples are {1e3 * made.latency_s:.1f} ms older than stamped, by the IMU's"
             " clock: jaxekf align writes a calibration that makes it good"
         )
-    angle = float(np.linalg.norm(made.alignment))
-    sigma = float(np.sqrt(np.linalg.eigvalsh(made.alignment_cov)[-1]))
-    if angle > max(_TURNED, _SIGMAS * sigma):
+    if (turned := turned_deg(made)) is not None:
         warnings.append(
-            f"the tracked frame is turned by {np.rad2deg(angle):.1f} deg against the IMU's: jaxekf align"
+            f"the tracked frame is turned by {turned[0]:.1f} deg against the IMU's: jaxekf align"
             " writes a calibration that makes it good"
         )
     return warnings
@@ -302,7 +297,7 @@ def _of_units(recording: Recording, found: Evidence) -> list[str]:
         )
     if abs(found.rate_ratio - 1.0) > _RATE_OFF:
         warnings.append(f"the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker")
-    if found.farthest > _FARTHEST_M:
+    if found.farthest > FARTHEST_M:
         warnings.append(
             f"the tool is up to {found.farthest:.3g} m from the reference's origin: are these metres?"
         )

@@ -34,7 +34,7 @@ _TWO_AXES = 0.05
 LEAST_RATE = np.deg2rad(2.0)
 """rad/s: of slower turning noise decides how alike it is."""
 _LEAST_ACCELERATION = 0.1
-_NEARBY, _FAR = 0.02, 20.0
+_NEARBY, FARTHEST_M = 0.02, 20.0
 """Metres: no tracker has its tool always as near as the first, or as far as the second."""
 _STANDARD = 9.80665
 _G_WITHIN, _REMOVED_BELOW = 0.15, 0.5
@@ -92,7 +92,7 @@ def path_unit(found: Evidence) -> str | None:
         return None
     if found.acceleration < _LEAST_ACCELERATION * (THOUSAND if unit == "mm" else 1.0 / THOUSAND):
         return None
-    if found.farthest > _NEARBY if unit == "m" else found.farthest < _FAR:
+    if found.farthest > _NEARBY if unit == "m" else found.farthest < FARTHEST_M:
         return None
     return unit
 

@@ -320,7 +320,7 @@ def test_one_compilation(name):
 
 
 @pytest.mark.parametrize(
-    "name", scenario.long_form(list(MODELS), {"loose_pose", "visual_bilinear", "marg"})
+    "name", scenario.long_form(list(MODELS), {"loose_pose", "visual", "visual_bilinear", "marg"})
 )
 def test_many_runs(name):
     """Runs that leak into each other, or lanes that are transposed on the way in or out."""

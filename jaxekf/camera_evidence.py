@@ -15,7 +15,7 @@ from jaxekf.attitude_match import AttitudeMatch
 from jaxekf.errors import RecordingError
 from jaxekf.evidence import ALIKE, Evidence, evidence
 from jaxekf.plausible import FARTHEST_M, LEAST_RATE, check_gravity, fault, path_unit, rates_unit
-from jaxekf.recording import Camera, Flags, Optical, Recording
+from jaxekf.recording import Camera, Flags, Recording
 
 _MOST_IMAGES, _TRIED = 1500, 60
 """Images that are solved for, in the middle of a run, and of a camera whose images fit no pose, since that
@@ -67,7 +67,8 @@ def camera_evidence(recording: Recording) -> CameraEvidence | None:
     tried = np.isin(np.arange(len(enough)), some)
     if not resection.poses(_only(camera, tried)).valid.any():
         return CameraEvidence(len(some), 0, np.nan, 0.0, Evidence(), None)
-    found = resection.poses(_only(camera, enough))
+    usable = _only(camera, enough)
+    found = resection.poses(usable)
     posed = found.valid
     error = float(np.median(found.error[posed])) if posed.any() else np.nan
     sigma = 0.0
@@ -76,9 +77,7 @@ def camera_evidence(recording: Recording) -> CameraEvidence | None:
         sigma = float(np.median(reported)) if reported.size else 0.0
     told, matched, imu = Evidence(), None, recording.imu
     if imu is not None and posed.any():
-        optical = Optical(
-            camera.time_ns, found.q_ref_body, posed, found.position, latency_ns=camera.latency_ns
-        )
+        optical = resection.as_optical(usable)
         told = evidence(Recording(recording.name, optical=optical, imu=imu))
         try:
             matched = align(optical, imu, recording.path or recording.name)

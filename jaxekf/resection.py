@@ -151,9 +151,9 @@ def no_pose(place: Path | str, images: int) -> RecordingError:
     )
 
 
-def as_optical(camera: Camera) -> Optical:
-    """The raw pose of every image, as a tracker would report it."""
-    found = poses(camera)
+def as_optical(camera: Camera, most: int | None = None) -> Optical:
+    """The raw pose of every image, or of at most so many, as a tracker would report it; see `poses`."""
+    found = poses(camera, most)
     return Optical(
         camera.time_ns,
         found.q_ref_body,

@@ -54,10 +54,7 @@ def possible_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...
     """Names of the figures that this model and recording can show; none of fewer than ten instants."""
     if len(estimate.time_ns) < _LEAST_INSTANTS:
         return ()
-    trackers = (recording.optical, recording.markers, recording.camera)
-    tracked = (
-        any(stream is not None for stream in trackers) and look(estimate, recording).t.size > 0
-    )
+    tracked = look(estimate, recording).t.size > 0
     parts = {part.name for part in manifold.parts(estimate.model.space)}
     single = bool(marker_sensors(estimate, recording))
     needs = {

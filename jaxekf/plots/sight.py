@@ -88,9 +88,8 @@ def _sight(estimate: Estimated, raw: Optical, label: str) -> Sight:
 
 def _of_images(estimate: Estimated, camera: Camera) -> Sight:
     """Poses of some images, of each by itself; what is lost is told by all of them."""
-    found = resection.poses(camera, _MOST_IMAGES)
-    taken = camera.time_ns - camera.latency_ns
-    raw = Optical(taken, found.q_ref_body, found.valid, found.position)
+    raw = at_origin(resection.as_optical(camera, _MOST_IMAGES))
+    taken = raw.time_ns
     enough = np.asarray(camera.usable.sum(axis=1) >= resection.FEWEST)
     return _sight(estimate, raw, "pose of an image")._replace(
         known=seconds(taken[enough & (taken >= estimate.time_ns[0])], estimate),

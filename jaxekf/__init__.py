@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
     from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
     from jaxekf.errors import (
+        CacheError,
         FilterError,
         JaxekfError,
         MissingPackageError,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from jaxekf.online import estimate_online
     from jaxekf.parameters import load as load_parameters
     from jaxekf.parameters import save as save_parameters
+    from jaxekf.program_cache import keep_programs
     from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
     from jaxekf.requested import Every, every
     from jaxekf.result import Estimate, OutputEstimate, SensorRecord
@@ -51,6 +53,7 @@ __all__ = [
     "SO3",
     "AdditiveQuaternion",
     "Belief",
+    "CacheError",
     "Camera",
     "Consistency",
     "Diagnosis",
@@ -101,6 +104,7 @@ __all__ = [
     "get_model",
     "initial_belief",
     "jit",
+    "keep_programs",
     "load",
     "load_parameters",
     "manifold",
@@ -129,6 +133,7 @@ _PLACES = {
     "jaxekf.diagnostics": ("Diagnosis", "SensorDiagnosis", "diagnose", "diagnose_many"),
     "jaxekf.ekf": ("FilterOutput", "initial_belief", "run_filter", "run_filter_batch"),
     "jaxekf.errors": (
+        "CacheError",
         "FilterError",
         "JaxekfError",
         "MissingPackageError",
@@ -150,6 +155,7 @@ _PLACES = {
     "jaxekf.models": ("get_model",),
     "jaxekf.online": ("estimate_online",),
     "jaxekf.parameters": ("load_parameters", "save_parameters"),
+    "jaxekf.program_cache": ("keep_programs",),
     "jaxekf.recording": ("Camera", "Encoder", "Imu", "Markers", "Optical", "Recording", "Samples"),
     "jaxekf.requested": ("Every", "every"),
     "jaxekf.result": ("Estimate", "OutputEstimate", "SensorRecord"),

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 # A module may import those before it. What stands in one entry does not import its neighbours.
 ORDER = [
     ("errors", "lazy", "chi_square"),
-    ("rows", "optional", "memory"),
+    ("rows", "optional", "memory", "program_cache"),
     ("rotation", "linalg", "recording", "temporary", "projection"),
     ("three_unknowns", "placement", "resection"),
     ("files", "differential"),

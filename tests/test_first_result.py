@@ -6,16 +6,19 @@ import os
 import subprocess
 import sys
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 import click
+import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 from scipy import stats
 
 import jaxekf
 import tuning
-from jaxekf import chi_square
+from jaxekf import chi_square, program_cache
 from jaxekf.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -135,3 +138,113 @@ def test_chi_square_has_the_numbers_of_scipy():
     np.testing.assert_array_equal(chi_square.ppf(share, degrees), stats.chi2.ppf(share, degrees))
     np.testing.assert_array_equal(chi_square.cdf(value, degrees), stats.chi2.cdf(value, degrees))
     np.testing.assert_array_equal(chi_square.sf(value, degrees), stats.chi2.sf(value, degrees))
+
+
+COUNTED = """
+import collections, json, sys
+import jax
+
+events = collections.Counter()
+jax.monitoring.register_event_listener(lambda name, **_: events.update([name.split("/")[-1]]))
+
+
+def counts():
+    asked, read = events["compile_requests_use_cache"], events["cache_hits"]
+    return {"programs": asked, "compiled": asked - read, "written": events["cache_misses"]}
+"""
+FILTER_AND_GRADIENT = """
+import jax.numpy as jnp
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+import jaxekf
+
+if sys.argv[2] == "late":
+    jnp.sin(jnp.ones(3)).block_until_ready()
+early = counts()["compiled"]
+place = jaxekf.keep_programs(sys.argv[1])
+sys.path.insert(0, sys.argv[3])
+import toy_models
+from jaxekf.timeline import Rows, Steps
+
+one = np.eye(2)
+model = toy_models.linear_model(one, 0.1 * one, [one], [0.2 * one])
+time = np.arange(1.0, 5.0)[:, None]
+
+
+def likelihood(values):
+    rows = Rows(values, None, np.ones((4, 1, 2), bool), np.ones((4, 1)))
+    steps = Steps(time, np.ones_like(time), time > 0.0, None, {"sensor_0": rows}, {})
+    belief = jaxekf.Belief(jnp.zeros(2), jnp.eye(2))
+    return jaxekf.run_filter(model, model.parameters, belief, steps).instants.log_likelihood.sum()
+
+
+value, slope = jaxekf.jit(jax.value_and_grad(likelihood))(jnp.ones((4, 1, 2)))
+found = counts() | {"early": early, "value": float(value), "slope": slope.tolist()}
+print(json.dumps(found))
+"""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    """Would catch programs that are not kept, for their size, their time or a setting that came too late,
+    or whose key changes from process to process."""
+    runs = [
+        run_python(COUNTED + FILTER_AND_GRADIENT, tmp_path, when, ROOT / "tests")
+        for when in ("first", "first", "late")
+    ]
+    assert runs[0]["programs"] > 1
+    assert runs[0]["compiled"] == runs[0]["written"] == runs[0]["programs"]
+    assert runs[1]["programs"] == runs[0]["programs"]
+    assert runs[1]["compiled"] == runs[1]["written"] == 0
+    assert runs[2]["compiled"] == runs[2]["early"] > 0
+    assert all(run["value"] == runs[0]["value"] for run in runs)
+    assert all(run["slope"] == runs[0]["slope"] for run in runs)
+
+
+def test_kept_programs_are_apart_by_version_and_processor(tmp_path, monkeypatch):
+    """Would catch a folder shared by machines or releases whose programs do not run on one another."""
+    info = tmp_path / "cpuinfo"
+    names = []
+    for flags in ("fpu avx2", "avx2 fpu", "fpu avx2 avx512f", ""):
+        info.write_text(f"processor : 0\nmodel name : A: b\nflags : {flags}\n\nprocessor : 1\n")
+        monkeypatch.setattr(program_cache, "_CPU_INFO", info)
+        names.append(program_cache.processor())
+    monkeypatch.setattr(program_cache, "_CPU_INFO", tmp_path / "none")
+    names.append(program_cache.processor())
+    assert names[0] == names[1]
+    assert len(set(names)) == 4
+
+
+def test_keeping_programs_changes_folder_and_refuses_one_line(tmp_path, restored_cache):
+    """Would catch a second folder that JAX ignores, and a traceback for one that cannot be written, or
+    settings that a failed call left half made."""
+    first = jaxekf.keep_programs(tmp_path / "first")
+    jax.jit(lambda x: x * 3.25)(np.ones(3)).block_until_ready()
+    second = jaxekf.keep_programs(tmp_path / "second")
+    jax.jit(lambda x: x * 4.25)(np.ones(3)).block_until_ready()
+    assert [any(place.iterdir()) for place in (first, second)] == [True, True]
+    assert first.parent == tmp_path / "first" and version("jaxlib") in first.name
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(jaxekf.CacheError, match="expected a folder that can be written") as refused:
+        jaxekf.keep_programs(tmp_path / "file")
+    assert "\n" not in str(refused.value)
+    assert jax.config.jax_compilation_cache_dir == str(second)
+
+
+@pytest.fixture
+def restored_cache():
+    names = ("compilation_cache_dir", "persistent_cache_min_compile_time_secs")
+    names = [f"jax_{name}" for name in (*names, "persistent_cache_min_entry_size_bytes")]
+    before = {name: getattr(jax.config, name) for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+
+
+def test_the_default_folder_follows_the_environment(tmp_path, monkeypatch):
+    """Would catch programs written beside the user's other files instead of the cache folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert program_cache.default_folder() == tmp_path / "jaxekf"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert program_cache.default_folder() == Path.home() / ".cache" / "jaxekf"

@@ -248,3 +248,103 @@ def test_the_default_folder_follows_the_environment(tmp_path, monkeypatch):
     assert program_cache.default_folder() == tmp_path / "jaxekf"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert program_cache.default_folder() == Path.home() / ".cache" / "jaxekf"
+
+
+OPTIMISER = """
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+import jaxekf
+from tuning.walk import Walk
+
+jaxekf.keep_programs(sys.argv[1])
+slopes = np.array([1.0, 3.0, 10.0])
+walk, found = Walk(np.array([1.0, -2.0, 0.5]), None), []
+for _ in range(8):
+    point = np.asarray(walk.candidate)
+    walk.move(float(0.5 * point @ (slopes * point)), slopes * point, True)
+    found.append(counts()["programs"])
+print(json.dumps({"programs": found, "value": walk.value}))
+"""
+
+
+def test_the_optimiser_is_two_programs(tmp_path):
+    """Would catch optax called operation by operation: eighty programs, and two more at each step."""
+    found = run_python(COUNTED + OPTIMISER, tmp_path)
+    assert found["programs"][-1] == found["programs"][0] <= 3
+    assert found["value"] < 0.1
+
+
+DATA = """
+import dataclasses
+
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+import jaxekf
+from jaxekf.datasets import demo
+from tuning.data import prepare
+from tuning.descent import total_counts
+from tuning.objectives import attitude_error, innovation_likelihood
+
+jaxekf.keep_programs(sys.argv[1])
+runs = [jaxekf.load(path) for path in demo.paths(demo.TRAINING[:1])]
+model = jaxekf.get_model("loose")
+state = model.space
+start = type(state)(*(np.eye(1, *part.shape)[0] for part in state))
+# A model's own start is its own affair.
+model = dataclasses.replace(model, initial_mean=lambda first: start)
+before = counts()["programs"]
+data = prepare(model, runs)
+aim = attitude_error() + innovation_likelihood()
+counted = total_counts([data], aim)
+shown = {name: int(number) for name, number in counted.items()}
+print(json.dumps({"programs": counts()["programs"] - before, "counted": shown}))
+"""
+
+
+def test_preparing_runs_compiles_nothing(tmp_path):
+    """Would catch a program compiled for each shape of array that the tuner takes or counts in."""
+    found = run_python(COUNTED + DATA, tmp_path)
+    assert found["programs"] == 0
+    assert found["counted"]["attitude"] > 1000 and found["counted"]["likelihood"] > 1000
+
+
+COMMAND = """
+from jaxekf.cli import main
+
+main(sys.argv[1:], standalone_mode=False)
+print(json.dumps(counts()))
+"""
+
+
+def test_a_command_compiles_nothing_the_second_time(tmp_path):
+    """Would catch a command line that keeps only what was slow to compile, or keeps it elsewhere."""
+    cache, made = tmp_path / "cache", tmp_path / "runs"
+    quick = {"JAXEKF_CACHE": str(cache), "JAXEKF_COMPILE": "quick"}
+    run_python(COUNTED + COMMAND, "simulate", "-o", made, "--duration", 5, **quick)
+    (run,) = [path.parent for path in made.rglob("recording.toml")]
+    first, second = (
+        run_python(COUNTED + COMMAND, "estimate", run, "-o", tmp_path / name, **quick)
+        for name in ("first", "second")
+    )
+    assert first["written"] == first["compiled"] > 0
+    assert second["programs"] == first["programs"]
+    assert second["compiled"] == 0
+    assert [path.name for path in cache.iterdir()] == [
+        f"jaxlib-{version('jaxlib')}-{program_cache.processor()}"
+    ]
+
+
+def test_a_folder_that_cannot_be_written_is_one_note(tmp_path):
+    """Would catch a command that fails, or says nothing, for a cache that was asked for and cannot be."""
+    (tmp_path / "file").write_text("no folder")
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxekf", "report", str(tmp_path / "none")],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "JAXEKF_CACHE": str(tmp_path / "file")},
+        check=False,
+    )
+    notes = [line for line in done.stderr.splitlines() if "not kept" in line]
+    assert len(notes) == 1 and "Traceback" not in done.stderr

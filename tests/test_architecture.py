@@ -12,8 +12,8 @@ import tuning
 ROOT = Path(__file__).parents[1]
 # A module may import those before it. What stands in one entry does not import its neighbours.
 ORDER = [
-    ("errors",),
-    ("rows", "optional", "memory"),
+    ("errors", "lazy", "chi_square"),
+    ("rows", "optional", "memory", "program_cache"),
     ("rotation", "linalg", "recording", "temporary", "projection"),
     ("three_unknowns", "placement", "resection"),
     ("files", "differential"),
@@ -66,7 +66,7 @@ ORDER = [
         "models.visual",
     ),
     ("models",),
-    ("parameters", "robust", "static_noise", "regions"),
+    ("parameters", "robust_weights", "static_noise", "regions"),
     ("result", "smoother"),
     ("estimation", "iterated"),
     ("metrics", "simulate", "online", "stream", "consistency"),
@@ -107,6 +107,7 @@ ORDER = [
     ("report.tunings",),
     ("report.page",),
     ("report",),
+    ("cli.commands",),
     ("cli.console", "cli.machine", "cli.options"),
     ("cli.comparison",),
     ("cli.simulate", "cli.estimate", "cli.report", "cli.allan", "cli.folds", "cli.imports"),

@@ -11,16 +11,15 @@ from typing import Any
 import jax
 from jax import Array
 
-from jaxekf import linalg, linearise, manifold, patterned
+from jaxekf import linearise, manifold
 from jaxekf.model import Model
 from jaxekf.system import (
     Measurement,
     Piece,
     Transition,
-    cut,
-    is_diagonal,
-    known,
     measurement,
+    noise_of,
+    pattern_of,
     specified,
 )
 
@@ -31,8 +30,8 @@ class AboutSystem:
 
     model: Model
     transition: Transition
-    """Its piece is ``(params, x, after, w, u, dt)`` to how far ``after`` is missed, the unknown blocks of
-    F and G, and the noise."""
+    """Its piece is ``(params, x, after, w, u, dt)`` to how far ``after`` is missed, and the unknown bands of
+    F and G."""
     measurements: dict[str, Measurement]
     start: Piece
     """``(params, first, x)`` to the error of ``x`` counted from ``first``, and the derivative of one
@@ -43,18 +42,11 @@ class AboutSystem:
     def prepare(self, params: Any) -> dict[str, tuple[Array, ...]]:
         """What the steps need of the parameters, for one run."""
         found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
-        for name, piece in self._pieces().items():
-            found[name] = piece.prepare(params)
+        found["transition"] = self.transition.piece.prepare(params)
+        found["process noise"] = self.transition.sigma.prepare(params)
+        found["start"] = self.start.prepare(params)
+        found["move"] = self.move.prepare(params)
         return found
-
-    def _pieces(self) -> dict[str, Piece]:
-        return {"transition": self.transition.piece, "start": self.start, "move": self.move}
-
-    @property
-    def is_plain(self) -> bool:
-        """As `System.is_plain`."""
-        pieces = [m.piece for m in self.measurements.values()]
-        return all(p.is_plain for p in [*pieces, *self._pieces().values()])
 
 
 def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> AboutSystem:
@@ -84,7 +76,7 @@ def _build(model: Model, leaves: Any, tree: Any) -> AboutSystem:
         _transition(model, params, x, u),
         {
             name: measurement(
-                model, model.sensor(name), params, x, u, sample, linearise.linearise_residual
+                model, model.sensor(name), params, x, u, sample, linearise.residual_blocks
             )
             for name, sample in rows.items()
         },
@@ -95,16 +87,16 @@ def _build(model: Model, leaves: Any, tree: Any) -> AboutSystem:
 
 def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
-    sigma = known(model.process_noise, params, dt)
-    w = jax.ShapeDtypeStruct(sigma.value.shape[:1], dt.dtype)
-    whole = known(partial(linearise.linearise_between, model), params, x, x, w, u, dt)
-    state, noise = patterned.pattern(whole[1]), patterned.pattern(whole[2])
-    diagonal = is_diagonal(sigma)
+    sigma, diagonal = noise_of(model.process_noise, params, dt)
+    w = jax.ShapeDtypeStruct(jax.eval_shape(model.process_noise, params, dt).shape[:1], dt.dtype)
+    linearised = partial(linearise.between_blocks, model)
+    spec = (params, x, x, w, u, dt)
+    state = pattern_of(lambda *args: linearised(*args).f, *spec)
+    noise = pattern_of(lambda *args: linearised(*args).g, *spec)
 
-    def step(params: Any, x: Any, after: Any, w: Array, u: Any, dt: Array) -> Any:
-        missed, f, g = linearise.linearise_between(model, params, x, after, w, u, dt)
-        sigma = model.process_noise(params, dt)
-        sigma = linalg.diagonal(sigma) if diagonal else sigma
-        return missed, cut(f, state), cut(g, noise), sigma
+    def step(*args: Any) -> Any:
+        found = linearised(*args)
+        return found.missed, found.f.bands(state), found.g.bands(noise)
 
-    return Transition(Piece(step, params, x, x, w, u, dt), state, noise, diagonal)
+    density = Piece(lambda *args: [sigma(*args)], params, dt)
+    return Transition(Piece(step, *spec), density, state, noise, diagonal)

@@ -1,116 +1,162 @@
 """The covariance algebra of the filter on lanes, each piece with its derivative in closed form.
 
-Covariances are symmetric but for rounding, and so are their cotangents. The derivatives of the
-update are those of Parellier, Barrau and Bonnabel (2023), extended to a block of rows taken after
-others, to the log-likelihood and to the slope of the measurement.
+Covariances are symmetric but for rounding, and so are their cotangents. Rows of a measurement are taken one
+after the other: each is a division, and no matrix is factored. The derivatives are those of Parellier,
+Barrau and Bonnabel (2023), row by row, extended to the log-likelihood and to the slope of the measurement.
 """
 
 import operator
-from functools import cache, partial, reduce
+from functools import cache, reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jaxekf import linalg, patterned
-from jaxekf.kernels import loop
-from jaxekf.lanes import written_sum
-from jaxekf.patterned import Pattern
+from jaxekf.lanes import along, folded_sum, stage, written_sum
+from jaxekf.patterned import Bands, Pattern, Row
 
+_VARIANCES_PER_LOG = 4
 _LOG_2PI = float(np.log(2.0 * np.pi))
-_PIVOTS_PER_LOG = 4
 
 
 def product(left: Array, right: Array) -> Array:
     """Matrix product written out, (i, k, lanes), (k, j, lanes) to (i, j, lanes)."""
-    return written_sum([left[:, k, None] * right[None, k] for k in range(right.shape[0])])
+    shape = (*left.shape[:2], *right.shape[1:])
+    return folded_sum(along(left, shape, 0, 1) * along(right, shape, 1, 2), 1)
 
 
 def product_transposed(left: Array, right: Array) -> Array:
     """``left @ right.T``, (i, k, lanes), (j, k, lanes) to (i, j, lanes)."""
-    return written_sum([left[:, k, None] * right[None, :, k] for k in range(right.shape[1])])
-
-
-def transposed_product(left: Array, right: Array) -> Array:
-    """``left.T @ right``, (k, i, lanes), (k, j, lanes) to (i, j, lanes)."""
-    return written_sum([left[k, :, None] * right[k, None] for k in range(right.shape[0])])
+    shape = (left.shape[0], *right.shape)
+    return folded_sum(along(left, shape, 0, 2) * along(right, shape, 1, 2), 2)
 
 
 def apply(matrix: Array, vector: Array) -> Array:
     """Matrix times vector, (i, k, lanes), (k, lanes) to (i, lanes)."""
-    return written_sum([matrix[:, k] * vector[k][None] for k in range(vector.shape[0])])
+    return folded_sum(matrix * along(vector, matrix.shape, 1), 1)
+
+
+def dot(left: Array, right: Array) -> Array:
+    """Scalar product, (n, lanes), (n, lanes) to (1, lanes)."""
+    return folded_sum(left * right, 0, keep=True)
 
 
 def outer(left: Array, right: Array) -> Array:
     """Outer product, (i, lanes), (j, lanes) to (i, j, lanes)."""
-    return left[:, None] * right[None]
+    shape = (left.shape[0], *right.shape)
+    return along(left, shape, 0) * along(right, shape, 1)
 
 
 def on_diagonal(values: Array) -> Array:
     """Diagonal matrices, (n, lanes) to (n, n, lanes)."""
-    # Row by row: the derivative of a broadcast would be a reduction, which `kernels.block` cannot hold.
     here = np.eye(values.shape[0], dtype=bool)[:, :, None]
-    return jnp.stack([jnp.where(row, values, 0.0) for row in here])
+    return jnp.where(here, values[:, None], 0.0)
 
 
-def add_on_diagonal(matrix: Array, values: Array) -> Array:
-    """``matrix + diag(values)``, (n, n, lanes), (n, lanes), in one pass."""
-    here = np.eye(values.shape[0], dtype=bool)[:, :, None]
-    return matrix + jnp.where(here, values[:, None], 0.0)
+# --- M P M' and the prediction ------------------------------------------------------------------------
 
 
-add_on_diagonal_with_adjoint = jax.custom_vjp(add_on_diagonal)
-"""The same, its derivative without the reduction that JAX's own would be."""
-add_on_diagonal_with_adjoint.defvjp(
-    lambda matrix, values: (add_on_diagonal(matrix, values), None),
-    lambda _, cotangent: (cotangent, linalg.diagonal(cotangent)),
-)
+def congruence(p: Pattern, bands: Bands, cov: Array) -> Array:
+    """``M P M'``, symmetric but for rounding; of variances (n, lanes) instead of P, a diagonal one."""
+    return _doubled(p, bands, _half(p, bands, cov))
 
 
-# --- M P M' -------------------------------------------------------------------------------------------
+def _half(p: Pattern, bands: Bands, cov: Array) -> Array:
+    """``M P``."""
+    if cov.ndim == 2:
+        return stage(patterned.dense(p, bands, cov.shape[-1], cov.dtype) * cov[None])
+    return stage(patterned.multiply(p, bands, cov))
 
 
-def congruence(p: Pattern, block: Array | None, cov: Array) -> tuple[Array, Array]:
-    """``M P M'`` and ``M P``."""
-    half = loop(partial(patterned.multiply, p), block, cov)
-    whole = loop(lambda b, h: patterned.multiply(p, b, h, axis=1), block, half)
-    return linalg.symmetrise(whole), half
+def _doubled(p: Pattern, bands: Bands, half: Array) -> Array:
+    """``M P M'`` from ``M P``."""
+    return stage(patterned.multiply(p, bands, half, axis=1))
 
 
 def _congruence_pullback(
-    p: Pattern, block: Array | None, half: Array, cotangent: Array
-) -> tuple[Array | None, Array]:
-    """Cotangents of the block and of P: ``2 B M P`` where M is unknown, ``M' B M``."""
-    back, turned = p.transposed, patterned.transpose(block)
-    first = loop(partial(patterned.multiply, back), turned, cotangent)
-    cov = loop(lambda t, f: patterned.multiply(back, t, f, axis=1), turned, first)
-    if block is None:
-        return None, cov
+    p: Pattern, bands: Bands, half: Array, diagonal: bool, cotangent: Array
+) -> tuple[Bands, Array]:
+    """Cotangents of the bands, ``2 B M P``, and of P, ``M' B M`` (or the diagonal of it)."""
+    back, turned = p.transposed, patterned.transpose(bands)
+    first = stage(patterned.multiply(back, turned, cotangent))
+    if diagonal:
+        matrix = patterned.dense(p, bands, half.shape[-1], half.dtype)
+        cov = folded_sum(first * matrix.swapaxes(0, 1), 1)
+    else:
+        cov = patterned.multiply(back, turned, first, axis=1)
 
-    def slope(cotangent: Array, half: Array) -> Array:
-        rows = patterned.take(cotangent, p.rows, 0)
-        return 2.0 * product(rows, patterned.take(half, p.cols, 1))
+    def slope(rows: tuple[int, ...], cols: tuple[int, ...]) -> Array:
+        above = patterned.take(cotangent, rows, 0)
+        return stage(2.0 * product(above, patterned.take(half, cols, 1)))
 
-    return loop(slope, cotangent, half), cov
+    return tuple(slope(*band) for band in p.bands), stage(cov)
 
 
 @cache
 def congruence_with_adjoint(p: Pattern) -> Any:
-    """`congruence` of (block, P) with its derivative; returns ``M P M'`` only."""
+    """`congruence` of (bands, P) with its derivative."""
 
     @jax.custom_vjp
-    def function(block: Array | None, cov: Array) -> Array:
-        return congruence(p, block, cov)[0]
+    def function(bands: Bands, cov: Array) -> Array:
+        return congruence(p, bands, cov)
 
-    def forward(block: Array | None, cov: Array) -> Any:
-        whole, half = congruence(p, block, cov)
-        return whole, (block, half)
+    def forward(bands: Bands, cov: Array) -> Any:
+        half = _half(p, bands, cov)
+        return _doubled(p, bands, half), (bands, half)
 
     def backward(saved: Any, cotangent: Array) -> Any:
-        block, half = saved
-        return _congruence_pullback(p, block, half, cotangent)
+        return _congruence_pullback(p, *saved, False, cotangent)
+
+    function.defvjp(forward, backward)
+    return function
+
+
+def predicted(
+    state: Pattern, noise: Pattern, f: Bands, g: Bands, cov: Array, sigma: Array
+) -> Array:
+    """``F P F' + G Sigma G'``, symmetric; `sigma` is a covariance, or variances (n_w, lanes)."""
+    return _predicted(state, noise, f, g, cov, sigma)[0]
+
+
+def _predicted(
+    state: Pattern, noise: Pattern, f: Bands, g: Bands, cov: Array, sigma: Array
+) -> tuple[Array, tuple[Array, Array | None]]:
+    """The prediction, and ``F P`` and ``G Sigma`` (None where G is the identity)."""
+    half, spread = _half(state, f, cov), None
+    total = _doubled(state, f, half)
+    if not noise.is_identity:
+        spread = _half(noise, g, sigma)
+        total = total + _doubled(noise, g, spread)
+    elif sigma.ndim == 2:
+        total = total + on_diagonal(sigma)
+    else:
+        total = total + sigma
+    return stage(linalg.symmetrise(stage(total))), (half, spread)
+
+
+@cache
+def predicted_with_adjoint(state: Pattern, noise: Pattern) -> Any:
+    """`predicted` of (f, g, cov, sigma) with its derivative."""
+
+    @jax.custom_vjp
+    def function(f: Bands, g: Bands, cov: Array, sigma: Array) -> Array:
+        return predicted(state, noise, f, g, cov, sigma)
+
+    def forward(f: Bands, g: Bands, cov: Array, sigma: Array) -> Any:
+        found, halves = _predicted(state, noise, f, g, cov, sigma)
+        return found, (f, g, sigma, halves)
+
+    def backward(saved: Any, cotangent: Array) -> Any:
+        f, g, sigma, (half, spread) = saved
+        diagonal = sigma.ndim == 2
+        f_bar, cov = _congruence_pullback(state, f, half, False, cotangent)
+        if spread is None:
+            return f_bar, g, cov, linalg.diagonal(cotangent) if diagonal else cotangent
+        g_bar, sigma_bar = _congruence_pullback(noise, g, spread, diagonal, cotangent)
+        return f_bar, g_bar, cov, sigma_bar
 
     function.defvjp(forward, backward)
     return function
@@ -120,208 +166,128 @@ def congruence_with_adjoint(p: Pattern) -> Any:
 
 
 class Rows(NamedTuple):
-    """Rows taken together: residual (m, lanes), unknown block of the slope H, noise R, and which count.
+    """Rows taken together: residual (m, lanes), unknown bands of the slope H, noise R, and which count.
 
-    The noise is a covariance (m, m, lanes), or variances (m, lanes) where it is known to be diagonal.
+    The noise is a covariance (m, m, lanes), or variances (m, lanes) where it is known to be diagonal. Where
+    a row does not count its residual, slope and noise are finite.
     """
 
     residual: Array
-    slope: Array | None
+    slope: Bands
     noise: Array
     mask: Array
 
 
 class Gained(NamedTuple):
-    """State of an update while blocks of rows are taken."""
+    """State of an update while rows are taken."""
 
     cov: Array
     delta: Array
     log_likelihood: Array
 
 
-class _Factor(NamedTuple):
-    """``S = sum_k column_k column_k' / pivot_k`` of symmetric positive definite matrices on lanes.
+class Taken(NamedTuple):
+    """A row that was taken, for whoever goes back through it; (1, lanes) but for the gain."""
 
-    Column k holds rows k and later. The pivots are those of Cholesky's factor, squared.
-    """
-
-    columns: list[Array]
-    inverses: list[Array]
-
-    @property
-    def pivots(self) -> list[Array]:
-        """(lanes,) each; one that is not positive says that the matrix was not definite."""
-        return [column[0] for column in self.columns]
-
-    def ratio(self, row: int, k: int) -> Array:
-        """Element (row, k) of the unit lower factor."""
-        return self.columns[k][row - k] * self.inverses[k]
+    gain: Array
+    """(n, lanes)."""
+    inverse: Array
+    """One over the innovation's variance."""
+    scaled: Array
+    """The innovation times that; 0 where the row does not count."""
 
 
-def factor(size: int, column: Any, *args: Any) -> _Factor:
-    """Factor of symmetric positive definite matrices; no square root is taken.
-
-    ``column(j, *args)`` gives rows j and later of the matrix's column j, (size - j, lanes).
-    """
-    found = _Factor([], [])
-    for j in range(size):
-
-        def eliminated(found: _Factor, *args: Any, j: int = j) -> Array:
-            value = column(j, *args)
-            for k, earlier in enumerate(found.columns):
-                value = value - earlier[j - k :] * found.ratio(j, k)[None]
-            return value
-
-        found.columns.append(loop(eliminated, found, *args))
-        found.inverses.append(loop(lambda column: 1.0 / column[0], found.columns[j]))
-    return found
-
-
-def solve(factored: _Factor, right: list[Array]) -> list[Array]:
-    """Rows of ``inv(S) @ right``; rows are (n, lanes)."""
-    lowered: list[Array] = []
-    for i, row in enumerate(right):
-
-        def eliminate(row: Array, factored: _Factor, lowered: list[Array], i: int = i) -> Array:
-            for k, earlier in enumerate(lowered):
-                row = row - factored.ratio(i, k)[None] * earlier
-            return row
-
-        lowered.append(row if i == 0 else loop(eliminate, row, factored, lowered))
-    solved: list[Array] = []
-    for i in reversed(range(len(right))):
-
-        def substitute(row: Array, factored: _Factor, solved: list[Array], i: int = i) -> Array:
-            row = factored.inverses[i][None] * row
-            for k, later in zip(range(i + 1, len(right)), solved, strict=True):
-                row = row - factored.ratio(k, i)[None] * later
-            return row
-
-        solved.insert(0, loop(substitute, lowered[i], factored, solved))
-    return solved
-
-
-class Solved(NamedTuple):
-    """What an update and its derivative share; lists are over rows, each (columns, lanes)."""
-
-    factored: _Factor
-    right: list[Array]
-    """``[H P | e]``, hidden rows zero; with one more unit row for each measured number for derivatives."""
-    solved: list[Array]
-    """``inv(S)`` times it: ``[K' | inv(S) e | inv(S)]``."""
-
-
-def innovation_covariance(p: Pattern, slope: Array | None, noise: Array, cov: Array) -> Array:
+def innovation_covariance(p: Pattern, bands: Bands, noise: Array, cov: Array) -> Array:
     """``H P H' + R`` of all rows, hidden ones included."""
-    projected = loop(partial(patterned.multiply, p), slope, cov)
-    spread = loop(lambda s, h: patterned.multiply(p, s, h, axis=1), slope, projected)
+    projected = stage(patterned.multiply(p, bands, cov))
+    spread = stage(patterned.multiply(p, bands, projected, axis=1))
     return spread + (on_diagonal(noise) if noise.ndim == 2 else noise)
 
 
-def _right(
-    p: Pattern, i: int, with_inverse: bool, slope: Array | None, gained: Gained, rows: Rows
-) -> Array:
-    """Row i of ``[H P | e]``, zero where hidden, and of the identity beside it."""
-    row = patterned.row(p, slope, i, gained.cov)
-    row = jnp.zeros_like(gained.cov[0]) if row is None else row
-    moved = patterned.row(p, slope, i, gained.delta)
-    residual = rows.residual[i] if moved is None else rows.residual[i] - moved
-    seen = rows.mask[i][None]
-    parts = [jnp.where(seen, row, 0.0), jnp.where(seen, residual[None], 0.0)]
-    if with_inverse:
-        unit = np.eye(rows.mask.shape[0])[i][:, None]
-        parts.append(jnp.broadcast_to(jnp.asarray(unit, row.dtype), rows.mask.shape))
-    return lax.concatenate(parts, 0)
+def whitened(p: Pattern, rows: Rows) -> tuple[Pattern, Rows]:
+    """The same rows with noise of covariance one each, where it was not diagonal: multiplied by the inverse
+    of the Cholesky factor of the visible rows' noise. The likelihood wants `whitening_likelihood` more."""
+    if rows.noise.ndim == 2:
+        return p, rows
+    white = _whitener(rows)
+    lanes, dtype = rows.mask.shape[-1], rows.noise.dtype
+    full = patterned.whole(p)
+    matrix = patterned.cut(patterned.dense(p, rows.slope, lanes, dtype), full)
+    slope = tuple(stage(linalg.whiten(white, band)) for band in matrix)
+    residual = stage(linalg.whiten(white, rows.residual))
+    return full, Rows(residual, slope, jnp.ones_like(residual), rows.mask)
 
 
-def _innovation_column(
-    p: Pattern, j: int, slope: Array | None, right: list[Array], noise: Array, mask: Array
-) -> Array:
-    """Rows j and later of column j of ``H P H' + R``, hidden rows as in the identity."""
-    value = patterned.multiply(p, slope, right[j][: p.shape[1]])[j:]
-    first = np.arange(mask.shape[0] - j)[:, None] == 0
-    value = (
-        value + jnp.where(first, noise[j][None], 0.0) if noise.ndim == 2 else value + noise[j:, j]
-    )
-    return jnp.where(mask[j:] & mask[j][None], value, first.astype(value.dtype))
+def pattern_taken(p: Pattern, rows: Rows) -> Pattern:
+    """The pattern of the rows that `whitened` makes of these, whose own is `p`."""
+    return p if rows.noise.ndim == rows.mask.ndim else patterned.whole(p)
 
 
-def _solve(p: Pattern, gained: Gained, rows: Rows, with_inverse: bool) -> Solved:
-    count = range(rows.mask.shape[0])
-    right = [loop(partial(_right, p, i, with_inverse), rows.slope, gained, rows) for i in count]
-    column = partial(_innovation_column, p)
-    factored = factor(len(count), column, rows.slope, right, rows.noise, rows.mask)
-    return Solved(factored, right, solve(factored, right))
+def _whitener(rows: Rows) -> tuple[Array, Array]:
+    return stage(linalg.whitener(linalg.mask_covariance(rows.noise, rows.mask)))
 
 
-def sum_of_outer(left: list[Array], right: list[Array]) -> Array:
-    """``sum_i left_i right_i'``, rows (n, lanes) to (n, n, lanes)."""
-    return written_sum([outer(a, b) for a, b in zip(left, right, strict=True)])
+def whitening_likelihood(rows: Rows) -> Array:
+    """``log det inv(L)`` of what `whitened` multiplied by."""
+    inverses = _whitener(rows)[1]
+    return written_sum([jnp.log(inverses[i]) for i in range(inverses.shape[0])])
 
 
-def take(
-    p: Pattern, gained: Gained, rows: Rows, with_inverse: bool = False
-) -> tuple[Gained, Array, Solved]:
-    """The state after a block of rows, their smallest pivot, and what the derivative needs.
+def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Taken]]:
+    """The state after rows of diagonal noise, the smallest variance of an innovation, and each row taken.
 
-    The covariance is symmetric but for rounding; its cotangent must be symmetric.
-
-    The covariance is Joseph's ``(I - K H) P (I - K H)' + K R K'``, in the order ``half = P - K (H P)``,
-    ``half + (K R - half H') K'``: a gain that is rounded then counts only to the second order.
+    A row h of variance r with ``S = h' P h + r`` and gain ``k = P h / S`` makes Joseph's
+    ``(I - k h') P (I - k h')' + k r k'``, in the order ``P - k (P h)' + (k r - (P - k (P h)') h) k'``: a gain
+    that is rounded then counts only to the second order. The covariance stays symmetric but for rounding.
     """
-    found = _solve(p, gained, rows, with_inverse)
-    mask, noise, size = rows.mask, rows.noise, p.shape[1]
-
-    def half_way(cov: Array, solved: list[Array], right: list[Array]) -> Array:
-        return cov - sum_of_outer([k[:size] for k in solved], [r[:size] for r in right])
-
-    def remainder(half: Array, slope: Array | None, solved: list[Array], i: int) -> Array:
-        gain = [k[:size] for k in solved]
-        if noise.ndim == 2:
-            spread = gain[i] * noise[i][None]
-        else:
-            spread = written_sum([g * noise[k, i][None] for k, g in enumerate(gain)])
-        seen = patterned.row(p, slope, i, half, axis=1)
-        return jnp.where(mask[i][None], spread if seen is None else spread - seen, 0.0)
-
-    def finish(half: Array, rest: list[Array], solved: list[Array]) -> Array:
-        return half + sum_of_outer(rest, [k[:size] for k in solved])
-
-    half = loop(half_way, gained.cov, found.solved, found.right)
-    count = range(mask.shape[0])
-    rest = [loop(partial(remainder, i=i), half, rows.slope, found.solved) for i in count]
-    cov = loop(finish, half, rest, found.solved)
-
-    def move(delta: Array, solved: list[Array], right: list[Array]) -> Array:
-        pairs = zip(solved, right, strict=True)
-        return delta + written_sum([k[:size] * r[size][None] for k, r in pairs])
-
-    delta = loop(move, gained.delta, found.solved, found.right)
-    log_likelihood = gained.log_likelihood - 0.5 * loop(partial(_surprise, size), found, mask)
-    smallest = loop(lambda pivots: reduce(jnp.minimum, pivots), found.factored.pivots)
-    return Gained(cov, delta, log_likelihood), smallest, found
-
-
-def _surprise(size: int, found: Solved, mask: Array) -> Array:
-    """``e' inv(S) e + log det (2 pi S)`` of the rows that count; `size` columns before e."""
-    squares = [s[size] * r[size] for s, r in zip(found.solved, found.right, strict=True)]
-    # Few logarithms: pivots are multiplied first, few enough that no product over- or underflows.
-    pivots = found.factored.pivots
+    cov, delta, log_likelihood = gained
+    taken, variances, squares = [], [], []
+    for i in range(rows.mask.shape[0]):
+        row, seen = Row(p, rows.slope, i), rows.mask[i : i + 1]
+        noise, residual = rows.noise[i : i + 1], rows.residual[i : i + 1]
+        ph = stage(jnp.where(seen, row.times(cov), 0.0))
+        variance = stage(jnp.where(seen, row.dot(ph) + noise, 1.0))
+        inverse = stage(1.0 / variance)
+        residual = jnp.where(seen, residual - row.dot(delta), 0.0)
+        scaled = stage(residual * inverse)
+        gain = stage(ph * inverse)
+        half = cov - outer(gain, ph)
+        rest = stage(jnp.where(seen, gain * noise - row.times(half), 0.0))
+        cov = stage(half + outer(rest, gain))
+        delta = stage(delta + ph * scaled)
+        taken.append(Taken(gain, inverse, scaled))
+        variances.append(variance)
+        squares.append(residual * scaled)
+    # Few logarithms: variances are multiplied first, few enough that no product over- or underflows.
     products = [
-        reduce(operator.mul, pivots[i : i + _PIVOTS_PER_LOG])
-        for i in range(0, len(pivots), _PIVOTS_PER_LOG)
+        reduce(operator.mul, variances[i : i + _VARIANCES_PER_LOG])
+        for i in range(0, len(variances), _VARIANCES_PER_LOG)
     ]
-    visible = written_sum([mask[i].astype(squares[0].dtype) for i in range(mask.shape[0])])
-    return written_sum(squares) + written_sum([jnp.log(q) for q in products]) + visible * _LOG_2PI
+    visible = folded_sum(rows.mask.astype(cov.dtype), 0, keep=True)
+    surprise = written_sum([*squares, *map(jnp.log, products), visible * _LOG_2PI])
+    log_likelihood = stage(log_likelihood - 0.5 * surprise[0])
+    return Gained(cov, delta, log_likelihood), reduce(jnp.minimum, variances)[0], taken
 
 
 def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
-    """Take a block of rows; also the smallest pivot, positive where all went well.
-
-    The covariance is symmetric but for rounding, and making it exactly so is left to the caller.
-    """
+    """The state after rows of diagonal noise, and the smallest variance of an innovation."""
     after, smallest, _ = take(p, gained, rows)
     return after, smallest
+
+
+def back_through(
+    row: Array, seen: Array, gain: Array, matrix: Array, inner: Array, side: Array | None
+) -> tuple[Array, Array]:
+    """``A' B A + c h h' + (h t' + t h') / 2`` with ``A = I - k h'``, and ``B k``.
+
+    For the whole row h, a matrix B, ``c = inner``, (1, lanes), and a vector ``t = side``; None for 0.
+    """
+    image = stage(apply(matrix, gain))
+    arm = 0.5 * (dot(gain, image) + inner) * row - image
+    if side is not None:
+        arm = arm + 0.5 * side
+    arm = stage(jnp.where(seen, arm, 0.0))
+    return stage(matrix + outer(row, arm) + outer(arm, row)), image
 
 
 class _Saved(NamedTuple):
@@ -330,87 +296,74 @@ class _Saved(NamedTuple):
     cov: Array
     """P after it."""
     delta: Array
-    solved: Array
-    """``[K' | inv(S) e | inv(S)]``, (rows, columns, lanes)."""
-    slope: Array | None
-    mask: Array
+    """After it."""
+    taken: list[Taken]
+    rows: Rows
 
 
-def _update_pullback(
-    p: Pattern, diagonal: bool, saved: _Saved, cotangent: Gained
-) -> tuple[Gained, Rows]:
-    """Cotangents of what went into `update` from those of what came out."""
-    mask, slope, solved, size = saved.mask, saved.slope, saved.solved, p.shape[1]
-    back, turned = p.transposed, patterned.transpose(slope)
-    b, a, weight = cotangent.cov, cotangent.delta, cotangent.log_likelihood
-    both = mask[:, None] & mask[None]
-    lowered = loop(lambda solved, a: apply(solved[:, :size], a), solved, a)  # K' a
+def _update_pullback(p: Pattern, saved: _Saved, cotangent: Gained) -> tuple[Gained, Rows]:
+    """Cotangents of what went into `update` from those of what came out.
 
-    def error_of(lowered: Array, solved: Array, weight: Array) -> Array:
-        return lowered - weight[None] * solved[:, size]
-
-    error = loop(error_of, lowered, solved, weight)
-    turned_b = loop(lambda solved, b: product(solved[:, :size], b), solved, b)  # K' B
-
-    # N = K' B K + M, M the information: w / 2 (s s' - inv(S)).
-    def inner_of(turned_b: Array, solved: Array, weight: Array, both: Array) -> Array:
-        scaled = solved[:, size]
-        info = (0.5 * weight)[None, None] * (outer(scaled, scaled) - solved[:, size + 1 :])
-        return product_transposed(turned_b, solved[:, :size]) + jnp.where(both, info, 0.0)
-
-    inner = loop(inner_of, turned_b, solved, weight, both)
-
-    def of_noise(inner: Array, lowered: Array, solved: Array, mask: Array, both: Array) -> Array:
-        if diagonal:
-            return jnp.where(mask, linalg.diagonal(inner) - lowered * solved[:, size], 0.0)
-        return jnp.where(both, inner - linalg.symmetrise(outer(lowered, solved[:, size])), 0.0)
-
-    noise = loop(of_noise, inner, lowered, solved, mask, both)
-    pulled = a - loop(partial(patterned.multiply, back), turned, lowered)  # A' a
-
-    # The whole is B - H' T - T' H,  T = K' B - N H / 2 - s (A' a)' / 2.
-    def half(
-        slope: Array | None, inner: Array, turned_b: Array, solved: Array, pulled: Array
-    ) -> Array:
-        drawn = patterned.multiply(p.transposed, patterned.transpose(slope), inner, axis=1)
-        return turned_b - 0.5 * (drawn + outer(solved[:, size], pulled))
-
-    spread = loop(half, slope, inner, turned_b, solved, pulled)
-    whole = loop(partial(patterned.multiply, back), turned, spread)
-    cov = loop(lambda b, w: b - w - w.swapaxes(0, 1), b, whole)
-    delta = a - loop(partial(patterned.multiply, back), turned, error)
-    slope_bar = None
-    if slope is not None:
-
-        def of_slope(saved: _Saved, a: Array, error: Array, turned_b: Array) -> Array:
-            used = patterned.take(saved.cov, p.cols, 1)
-            pa = apply(used.swapaxes(0, 1), a)
-            moved = patterned.take(saved.delta, p.cols, 0)
-            gain = patterned.take(saved.solved, p.cols, 1)
-            whole = outer(saved.solved[:, size], pa) - outer(error, moved)
-            whole = whole - 2.0 * product(turned_b, used) - weight[None, None] * gain
-            whole = jnp.where(mask[:, None], whole, 0.0)
-            return patterned.take(whole, p.rows, 0)
-
-        slope_bar = loop(of_slope, saved, a, error, turned_b)
-    return Gained(cov, delta, weight), Rows(error, slope_bar, noise, mask)
+    Row by row, the last first, with ``a``, B and w the cotangents of delta, P and log-likelihood after the
+    row: ``c = k' a - w s`` is the residual's, ``k' B k - s k' a + w (s^2 - 1 / S) / 2`` the noise's and
+    ``s P a - c delta - 2 P B k - w k`` the slope's.
+    """
+    b, a, weight = cotangent.cov, cotangent.delta, cotangent.log_likelihood[None]
+    delta, cov, rows = saved.delta, saved.cov, saved.rows
+    residuals: list[Array] = []
+    noises: list[Array] = []
+    slopes: list[list[Array]] = []
+    for i in reversed(range(rows.mask.shape[0])):
+        row, seen, (gain, inverse, scaled) = (
+            Row(p, rows.slope, i),
+            rows.mask[i : i + 1],
+            saved.taken[i],
+        )
+        whole = stage(row.dense(gain))
+        drawn = stage(dot(gain, a))
+        error = stage(jnp.where(seen, drawn - weight * scaled, 0.0))
+        spread = stage(0.5 * weight * (scaled * scaled - inverse))
+        side = scaled * (a - whole * drawn)
+        before, image = back_through(whole, seen, gain, b, spread, side)
+        noises.append(jnp.where(seen, dot(gain, image) - scaled * drawn + spread, 0.0))
+        residuals.append(error)
+        slopes.append([])
+        ph = gain / inverse
+        for cols in row.unknown:
+            pulled = stage(scaled * a - 2.0 * image)
+            found = apply(patterned.take(cov, cols, 0), pulled)
+            found = found - error * patterned.take(delta, cols, 0)
+            found = found - weight * patterned.take(gain, cols, 0)
+            slopes[-1].append(jnp.where(seen, found, 0.0))
+        if p.bands and i:
+            cov = stage(cov + outer(gain, ph))
+            delta = stage(delta - ph * scaled)
+        a = stage(a - whole * error)
+        b = before
+    slopes.reverse()
+    places = [[rows for rows, _ in p.bands if i in rows] for i in range(len(slopes))]
+    bands = tuple(
+        stage(jnp.stack([slopes[r][places[r].index(band_rows)] for r in band_rows]))
+        for band_rows, _ in p.bands
+    )
+    noise, residual = (stage(jnp.concatenate(v[::-1])) for v in (noises, residuals))
+    return Gained(b, a, cotangent.log_likelihood), Rows(residual, bands, noise, rows.mask)
 
 
 @cache
-def update_with_adjoint(p: Pattern, diagonal: bool) -> Any:
-    """`update` of (gained, rows) with its derivative in closed form; whether the noise is diagonal."""
+def update_with_adjoint(p: Pattern) -> Any:
+    """`update` of (gained, rows) with its derivative in closed form."""
 
     @jax.custom_vjp
     def function(gained: Gained, rows: Rows) -> tuple[Gained, Array]:
         return update(p, gained, rows)
 
     def forward(gained: Gained, rows: Rows) -> Any:
-        after, smallest, found = take(p, gained, rows, with_inverse=True)
-        solved = loop(jnp.stack, found.solved)
-        return (after, smallest), _Saved(after.cov, after.delta, solved, rows.slope, rows.mask)
+        after, smallest, taken = take(p, gained, rows)
+        return (after, smallest), _Saved(after.cov, after.delta, taken, rows)
 
     def backward(saved: Any, cotangent: Any) -> Any:
-        gained, rows = _update_pullback(p, diagonal, saved, cotangent[0])
+        gained, rows = _update_pullback(p, saved, cotangent[0])
         return gained, rows._replace(mask=np.zeros(rows.mask.shape, jax.dtypes.float0))
 
     function.defvjp(forward, backward)

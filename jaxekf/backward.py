@@ -17,13 +17,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxekf import algebra, epochs, linalg, many, patterned
-from jaxekf.algebra import Gained, Rows, Solved
-from jaxekf.kernels import loop
-from jaxekf.lanes import written_sum
+from jaxekf.algebra import Gained
+from jaxekf.lanes import stage
 from jaxekf.model import Belief
-from jaxekf.patterned import Pattern
+from jaxekf.patterned import Bands, Pattern, Row
 from jaxekf.recursion import First, Given
-from jaxekf.step import Moment, Track, any_used, begin, blocks_of_rows, look, take_keeping
+from jaxekf.step import Moment, Track, any_used, begin, look, take_keeping
 from jaxekf.system import System
 
 
@@ -94,8 +93,8 @@ def _epoch(
 
 def lessened(p: Array, matrix: Array) -> Array:
     """``P - P L P``."""
-    lost = loop(algebra.product, p, loop(algebra.product, matrix, p))
-    return loop(lambda p, lost: linalg.symmetrise(p - lost), p, lost)
+    lost = stage(algebra.product(p, stage(algebra.product(matrix, p))))
+    return stage(linalg.symmetrise(p - lost))
 
 
 def smoothed(
@@ -103,7 +102,7 @@ def smoothed(
 ) -> Belief:
     """The belief of the filter with what came later."""
     p = belief.cov
-    delta = loop(algebra.apply, p, info.vector)
+    delta = stage(algebra.apply(p, info.vector))
     cov = lessened(p, info.matrix)
     correction = system.correction
     always = jnp.ones(p.shape[-1], bool)
@@ -111,7 +110,7 @@ def smoothed(
         prepared["correction"], belief.mean, delta, always, adjoint=adjoint
     )
     if not correction.reset.is_identity:
-        cov = algebra.congruence(correction.reset, reset, cov)[0]
+        cov = linalg.symmetrise(algebra.congruence(correction.reset, reset, cov))
     return Belief(mean, cov)
 
 
@@ -126,11 +125,11 @@ def _before_prediction(
     return carried(transition.state, found[1], info)
 
 
-def carried(p: Pattern, block: Array | None, info: Information) -> Information:
+def carried(p: Pattern, bands: Bands, info: Information) -> Information:
     """``M' a`` and ``M' L M``."""
-    back, turned = p.transposed, patterned.transpose(block)
-    vector = loop(partial(patterned.multiply, back), turned, info.vector)
-    return Information(vector, algebra.congruence(back, turned, info.matrix)[0])
+    back, turned = p.transposed, patterned.transpose(bands)
+    vector = stage(patterned.multiply(back, turned, info.vector))
+    return Information(vector, linalg.symmetrise(algebra.congruence(back, turned, info.matrix)))
 
 
 def _before_update(
@@ -150,9 +149,9 @@ def _before_update(
     linear = judged.linear
     gained = Gained(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
     taken = []
-    for slope, rows in blocks_of_rows(system.measurements, linear):
-        gained, solved = take_keeping(slope, gained, rows)
-        taken.append((slope, rows, solved))
+    for one in linear.values():
+        gained, kept = take_keeping(one.slope, gained, one.rows)
+        taken.append((algebra.pattern_taken(one.slope, one.rows), kept))
     correction = system.correction
     used = any_used(linear)
     _, reset, shift = correction.piece(
@@ -160,60 +159,29 @@ def _before_update(
     )
     if shift is not None:
         # The model's constraint moved the mean: what is known is counted from where it had been.
-        vector = info.vector + loop(algebra.apply, info.matrix, shift)
+        vector = info.vector + stage(algebra.apply(info.matrix, shift))
         info = info._replace(vector=vector)
     if not correction.reset.is_identity:
         info = carried(correction.reset, reset, info)
-    for slope, rows, solved in reversed(taken):
-        info = before_rows(slope, rows, solved, info)
+    for slope, kept in reversed(taken):
+        info = before_rows(slope, kept, info)
     return info
 
 
-def before_rows(p: Pattern, rows: Rows, found: Solved, info: Information) -> Information:
-    """``A' a + H' inv(S) e`` and ``A' L A + H' inv(S) H`` with ``A = I - K H``, of rows that
-    `step.take_keeping` took."""
+def before_rows(p: Pattern, kept: Any, info: Information) -> Information:
+    """``A' a + h s`` and ``A' L A + h h' / S`` with ``A = I - k h'``, of rows that `step.take_keeping` took."""
+    rows, taken = kept
     if many.are_many(rows.mask):
 
-        def one(info: Information, at: Any) -> tuple[Information, None]:
-            rows, found = at
-            return before_rows(p, rows, found, info), None
+        def one(info: Information, kept: Any) -> tuple[Information, None]:
+            return before_rows(p, kept, info), None
 
-        return lax.scan(one, info, (rows, found), reverse=True)[0]
-    size, back, turned = p.shape[1], p.transposed, patterned.transpose(rows.slope)
-    gain = [row[:size] for row in found.solved]
-    seen = [row[size] for row in found.solved]
-    inverse = [row[size + 1 :] for row in found.solved]
-
-    def push_of(gain: list[Array], seen: list[Array], vector: Array, mask: Array) -> Array:
-        """``inv(S) e - K' a``, (rows, lanes)."""
-        pushed = [
-            s - written_sum([g[k] * vector[k] for k in range(size)])
-            for g, s in zip(gain, seen, strict=True)
-        ]
-        return jnp.where(mask, jnp.stack(pushed), 0.0)
-
-    push = loop(push_of, gain, seen, info.vector, rows.mask)
-    vector = info.vector + loop(partial(patterned.multiply, back), turned, push)
-
-    def half_of(gain: Array, matrix: Array) -> Array:
-        """A row of ``K' L``."""
-        return written_sum([gain[k][None] * matrix[k] for k in range(size)])
-
-    half = loop(jnp.stack, [loop(half_of, g, info.matrix) for g in gain])
-
-    def inner_of(half: Array, gain: list[Array], inverse: list[Array], mask: Array) -> Array:
-        """``K' L K + inv(S)`` of the rows that count."""
-        known = jnp.where(mask[:, None] & mask[None], jnp.stack(inverse), 0.0)
-        return algebra.product_transposed(half, jnp.stack(gain)) + known
-
-    inner = loop(inner_of, half, gain, inverse, rows.mask)
-
-    # With T = K' L - (K' L K + inv(S)) H / 2 the whole is L - H' T - T' H.
-    def spread_of(slope: Array | None, inner: Array, half: Array) -> Array:
-        drawn = patterned.multiply(back, patterned.transpose(slope), inner, axis=1)
-        return half - 0.5 * drawn
-
-    spread = loop(spread_of, rows.slope, inner, half)
-    whole = loop(partial(patterned.multiply, back), turned, spread)
-    matrix = loop(lambda m, w: m - w - w.swapaxes(0, 1), info.matrix, whole)
+        return lax.scan(one, info, kept, reverse=True)[0]
+    vector, matrix = info
+    for i in reversed(range(rows.mask.shape[0])):
+        row, seen = Row(p, rows.slope, i).dense(vector), rows.mask[i : i + 1]
+        gain, inverse, scaled = taken[i]
+        matrix, _ = algebra.back_through(row, seen, gain, matrix, inverse, None)
+        push = jnp.where(seen, scaled - algebra.dot(gain, vector), 0.0)
+        vector = stage(vector + row * push)
     return Information(vector, matrix)

@@ -154,10 +154,10 @@ def run_filter_batch(
     inputs = given.moments.u
     what = _KEPT[keep]
     if adjoint:
-        runs, epochs = steps.dt.shape[:2]
+        runs, epochs, substeps = steps.dt.shape
         kept_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
         lanes = min(runs, blocks.LANES)
-        segment = recursion.segment_length(epochs, kept_bytes * lanes)
+        segment = recursion.segment_length(epochs, substeps, kept_bytes * lanes)
         if not checkpoint:
             segment = 1
         moving = reverse_only((prepared, First(belief, refused), given))

@@ -49,3 +49,8 @@ class ResourceError(JaxekfError):
 
 class MissingPackageError(JaxekfError):
     """What was asked needs a package that is not installed; the message says how to install it."""
+
+
+class SlowModelWarning(UserWarning):
+    """A model's function is right but does not become plain arithmetic for many runs at once; the message
+    names the operation."""

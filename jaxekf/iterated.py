@@ -33,8 +33,9 @@ from jaxekf.about import AboutSystem
 from jaxekf.algebra import Gained
 from jaxekf.backward import Information
 from jaxekf.errors import ModelError
-from jaxekf.kernels import loop
+from jaxekf.lanes import stage
 from jaxekf.model import Belief, Model, Parameters
+from jaxekf.outliers import Linear
 from jaxekf.recursion import Given
 from jaxekf.relinearise import turned
 from jaxekf.reverse_only import reverse_only
@@ -161,7 +162,7 @@ def _used(first: SmootherOutput, steps: Steps) -> Given:
 @lru_cache(maxsize=64)
 def _lanes(system: AboutSystem, devices: tuple[Any, ...]) -> Any:
     return own_derivative.with_own_derivative(
-        devices, system.is_plain, partial(_iteration, system, True)
+        devices, partial(_iteration, system, True)
     )
 
 
@@ -182,7 +183,7 @@ def _iteration(
 ) -> tuple[Path, Belief, Belief, Array]:
     """One step of Gauss and Newton: the path after it, the beliefs about it, and the longest move."""
     away, changed = system.start(prepared["start"], belief.mean, path.start, adjoint=adjoint)
-    delta = -loop(algebra.apply, changed, away)
+    delta = -stage(algebra.apply(changed, away))
     cov = turned(changed, belief.cov)
     before = jax.tree.map(backward.one_earlier, path.start, path.mean)
     places = _Place(given.moments, before, path.mean, path.noise)
@@ -199,7 +200,7 @@ def _iteration(
 
 def _linear(
     system: AboutSystem, prepared: Any, place: _Place, samples: Any, adjoint: bool
-) -> list[tuple[patterned.Pattern, algebra.Rows]]:
+) -> list[Linear]:
     """The samples of an instant linearised at the path."""
     linear = {}
     for name, sample in samples.items():
@@ -208,19 +209,23 @@ def _linear(
             prepared[f"sensor {name}"], place.after, place.moment.u, sample, adjoint=adjoint
         )
         linear[name] = step.hide(measurement, *found, sample.mask)
-    return step.blocks_of_rows(system.measurements, linear)
+    return list(linear.values())
 
 
 def _transition(system: AboutSystem, prepared: Any, place: _Place, adjoint: bool) -> Any:
-    return system.transition.piece(
+    """How far the path misses the transition, the bands of F and G, and the noise."""
+    dt = place.moment.dt
+    (sigma,) = system.transition.sigma(prepared["process noise"], dt, adjoint=adjoint)
+    found = system.transition.piece(
         prepared["transition"],
         place.before,
         place.after,
         place.noise,
         place.moment.u,
-        place.moment.dt,
+        dt,
         adjoint=adjoint,
     )
+    return *found, sigma
 
 
 def _ahead(
@@ -230,15 +235,13 @@ def _ahead(
     delta, cov = carry
     transition = system.transition
     missed, f, g, sigma = _transition(system, prepared, place, adjoint)
-    sigma = algebra.on_diagonal(sigma) if transition.diagonal else sigma
-    forth = loop(partial(patterned.multiply, transition.state), f, delta)
-    back = loop(partial(patterned.multiply, transition.noise), g, place.noise)
-    spread = algebra.congruence(transition.noise, g, sigma)[0]
-    cov = algebra.congruence(transition.state, f, cov)[0] + spread
+    forth = stage(patterned.multiply(transition.state, f, delta))
+    back = stage(patterned.multiply(transition.noise, g, place.noise))
+    cov = algebra.predicted(transition.state, transition.noise, f, g, cov, sigma)
     prior = Gained(cov, missed + forth - back, jnp.zeros_like(delta[0]))
     gained = prior
-    for slope, rows in _linear(system, prepared, place, samples, adjoint):
-        gained = step.take_block(slope, gained, rows, False)[0]
+    for one in _linear(system, prepared, place, samples, adjoint):
+        gained = step.take_block(one.slope, gained, one.rows, False)[0]
     cov = linalg.symmetrise(gained.cov)
     return (gained.delta, cov), _Forward(prior, gained.delta, cov)
 
@@ -265,11 +268,11 @@ def _epoch_back(
         found = _moved(system, prepared, place.after, forward.delta, forward.cov, info, adjoint)
         gained = forward.prior
         taken = []
-        for slope, rows in _linear(system, prepared, place, samples, adjoint):
-            gained, solved = step.take_keeping(slope, gained, rows)
-            taken.append((slope, rows, solved))
-        for slope, rows, solved in reversed(taken):
-            info = backward.before_rows(slope, rows, solved, info)
+        for one in _linear(system, prepared, place, samples, adjoint):
+            gained, kept = step.take_keeping(one.slope, gained, one.rows)
+            taken.append((algebra.pattern_taken(one.slope, one.rows), kept))
+        for slope, kept in reversed(taken):
+            info = backward.before_rows(slope, kept, info)
         info, noise = _before(system, prepared, place, info, adjoint)
         return info, (found[0], noise, found[1])
 
@@ -282,12 +285,9 @@ def _before(
     """The information before a transition, and the most probable process noise of it, ``Q G' a``."""
     transition = system.transition
     _, f, g, sigma = _transition(system, prepared, place, adjoint)
-    drawn = loop(
-        partial(patterned.multiply, transition.noise.transposed),
-        patterned.transpose(g),
-        info.vector,
-    )
-    noise = sigma * drawn if transition.diagonal else loop(algebra.apply, sigma, drawn)
+    turned = patterned.transpose(g)
+    drawn = stage(patterned.multiply(transition.noise.transposed, turned, info.vector))
+    noise = sigma * drawn if transition.diagonal else stage(algebra.apply(sigma, drawn))
     return backward.carried(transition.state, f, info), noise
 
 
@@ -302,7 +302,7 @@ def _moved(
 ) -> tuple[Belief, Array]:
     """A state of the path moved to where it is most probable, its covariance counted from there, and how
     many standard deviations it moved."""
-    delta = delta + loop(algebra.apply, cov, info.vector)
+    delta = delta + stage(algebra.apply(cov, info.vector))
     cov = backward.lessened(cov, info.matrix)
     longest = lax.stop_gradient(jnp.max(jnp.abs(delta) / jnp.sqrt(linalg.diagonal(cov)), axis=0))
     moved, reset = system.move(prepared["move"], mean, delta, adjoint=adjoint)

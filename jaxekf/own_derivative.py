@@ -1,7 +1,6 @@
 """Scans on lanes as functions of many runs whose reverse derivative is JAX's own, block by block."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -9,22 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import kernels
 from jaxekf.blocks import Devices, in_blocks, over_more_runs
 
 
-def with_own_derivative(
-    devices: Devices, plain: bool, scan: Callable[..., Any]
-) -> Callable[..., Any]:
+def with_own_derivative(devices: Devices, scan: Callable[..., Any]) -> Callable[..., Any]:
     """A scan of trees with lanes last as a function of many runs, on the first axis.
 
     Its reverse derivative is JAX's own, taken block by block on lanes; `vmap` of both is the same for more
-    runs. `plain` says that the scan is arithmetic only.
+    runs.
     """
-    whole = partial(kernels.block, scan) if plain else scan
 
     def run(_: None, *trees: Any) -> Any:
-        return in_blocks(devices, lambda _, *trees: (whole(*trees), None), None, *trees)
+        return in_blocks(devices, lambda _, *trees: (scan(*trees), None), None, *trees)
 
     def run_back(_: None, cotangents: Any, *trees: Any) -> Any:
         def one(_: None, cotangents: Any, *trees: Any) -> Any:

@@ -9,18 +9,24 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import NDArray
 
-from jaxekf.lanes import written_sum
+from jaxekf.lanes import along, folded_sum, stage, written_sum
 from jaxekf.structure import Known
+
+_FILL = 1.3
+"""How many times as many numbers as are unknown a band of several rows may have."""
+
+Bands = tuple[Array, ...]
+"""The unknown numbers of a matrix: for each band of its pattern, (rows, cols, lanes)."""
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A matrix that is `base` plus a block of unknown numbers at `rows` and `cols`, where `base` is 0."""
+    """A matrix that is `base` plus rectangular bands of unknown numbers, where `base` is 0."""
 
     shape: tuple[int, int]
     constants: tuple[tuple[float, ...], ...]
-    rows: tuple[int, ...]
-    cols: tuple[int, ...]
+    bands: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
+    """Rows and columns of each band, ascending; no two bands share a number."""
 
     @property
     def base(self) -> NDArray[np.float64]:
@@ -29,49 +35,69 @@ class Pattern:
 
     @property
     def transposed(self) -> "Pattern":
-        """The pattern of the transposed matrix."""
-        return _pattern(self.base.T, self.cols, self.rows)
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether nothing is unknown."""
-        return not self.rows
+        """The pattern of the transposed matrix; its bands are those of `transpose`."""
+        bands = tuple((cols, rows) for rows, cols in self.bands)
+        return Pattern(self.shape[::-1], _nested(self.base.T), bands)
 
     @property
     def is_identity(self) -> bool:
         """Whether it is the identity, whatever it was computed from."""
         square = self.shape[0] == self.shape[1]
-        return self.is_constant and square and bool(np.all(self.base == np.eye(self.shape[0])))
+        return square and not self.bands and bool(np.all(self.base == np.eye(self.shape[0])))
+
+
+def _nested(base: NDArray[Any]) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(float(v) for v in row) for row in base)
 
 
 def pattern(matrix: Known) -> Pattern:
-    """The pattern of a matrix from what is known of it."""
+    """The pattern of a matrix from what is known of it: rows with much the same unknown columns are one
+    band."""
     unknown = ~np.asarray(matrix.known)
-    rows = np.flatnonzero(unknown.any(axis=1))
-    cols = np.flatnonzero(unknown.any(axis=0))
+    groups: list[list[int]] = []
+    for row in np.flatnonzero(unknown.any(axis=1)):
+        joined = [*groups[-1], int(row)] if groups else []
+        if joined and _area(unknown, joined) <= _FILL * unknown[joined].sum():
+            groups[-1] = joined
+        else:
+            groups.append([int(row)])
     base = np.where(unknown, 0.0, matrix.value)
-    base[np.ix_(rows, cols)] = 0.0
-    return _pattern(base, tuple(map(int, rows)), tuple(map(int, cols)))
+    bands = []
+    for rows in groups:
+        cols = np.flatnonzero(unknown[rows].any(axis=0))
+        base[np.ix_(rows, cols)] = 0.0
+        bands.append((tuple(rows), tuple(map(int, cols))))
+    return Pattern((base.shape[0], base.shape[1]), _nested(base), tuple(bands))
 
 
-def _pattern(base: NDArray[Any], rows: tuple[int, ...], cols: tuple[int, ...]) -> Pattern:
-    constants = tuple(tuple(float(v) for v in row) for row in base)
-    return Pattern((base.shape[0], base.shape[1]), constants, rows, cols)
+def _area(unknown: NDArray[np.bool_], rows: list[int]) -> int:
+    return len(rows) * int(unknown[rows].any(axis=0).sum())
+
+
+def whole(p: Pattern) -> Pattern:
+    """The pattern of a matrix that may have numbers in any column in which `p` has one: what is left of it
+    when its rows are mixed."""
+    used = (p.base != 0.0).any(axis=0)
+    for _, cols in p.bands:
+        used[list(cols)] = True
+    unknown = np.broadcast_to(used, p.shape)
+    return pattern(Known(np.zeros(p.shape), ~unknown))
 
 
 def stack(patterns: Sequence[Pattern]) -> Pattern:
-    """The pattern of matrices with the same columns, one below the other."""
-    base = np.concatenate([p.base for p in patterns])
-    unknown = np.zeros(base.shape, bool)
-    start = 0
+    """The pattern of matrices with the same columns, one below the other; the bands are those of all."""
+    bands, start = [], 0
     for p in patterns:
-        unknown[np.ix_([start + r for r in p.rows], p.cols)] = True
+        bands += [(tuple(start + r for r in rows), cols) for rows, cols in p.bands]
         start += p.shape[0]
-    return pattern(Known(base, ~unknown))
+    base = np.concatenate([p.base for p in patterns])
+    return Pattern((base.shape[0], base.shape[1]), _nested(base), tuple(bands))
 
 
 def take(array: Array, index: Sequence[int], axis: int) -> Array:
-    """Rows of `array` along `axis`, as slices of consecutive ones."""
+    """Entries of `array` along `axis`, as slices of consecutive ones."""
+    if list(index) == list(range(array.shape[axis])):
+        return array
     pieces = [lax.slice_in_dim(array, run[0], run[-1] + 1, axis=axis) for run in _runs(list(index))]
     return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
 
@@ -86,22 +112,29 @@ def _runs(index: Sequence[int]) -> list[list[int]]:
     return runs
 
 
-def transpose(block: Array | None) -> Array | None:
-    """The unknown block of the transposed matrix."""
-    return None if block is None else block.swapaxes(0, 1)
+def cut(matrix: Array, p: Pattern) -> Bands:
+    """The unknown bands of a whole matrix, or of a cotangent of one."""
+    return tuple(take(take(matrix, rows, 0), cols, 1) for rows, cols in p.bands)
 
 
-def dense(p: Pattern, block: Array | None, lanes: int, dtype: Any) -> Array:
+def transpose(bands: Bands) -> Bands:
+    """The bands of the transposed matrix."""
+    return tuple(band.swapaxes(0, 1) for band in bands)
+
+
+def dense(p: Pattern, bands: Bands, lanes: int, dtype: Any) -> Array:
     """The whole matrix, (rows, cols, lanes)."""
-    base = np.broadcast_to(p.base[:, :, None], (*p.shape, lanes))
-    if block is None or not p.rows:
-        return jnp.asarray(base, dtype)
-    wide = _placed(block, p.cols, p.shape[1], 1)
-    return _placed(wide, p.rows, p.shape[0], 0) + jnp.asarray(base, dtype)
+    total = jnp.broadcast_to(jnp.asarray(p.base[:, :, None], dtype), (*p.shape, lanes))
+    for (rows, cols), band in zip(p.bands, bands, strict=True):
+        wide = _placed(_placed(band, cols, p.shape[1], 1), rows, p.shape[0], 0)
+        total = total + wide
+    return total
 
 
 def _placed(array: Array, index: Sequence[int], size: int, axis: int) -> Array:
     """`array` spread along `axis` to the places of `index` among zeros, `size` in all."""
+    if len(index) == size:
+        return array
     pieces, filled, taken = [], 0, 0
 
     def zeros(count: int) -> Array:
@@ -119,16 +152,15 @@ def _placed(array: Array, index: Sequence[int], size: int, axis: int) -> Array:
     return lax.concatenate(pieces, axis)
 
 
-def multiply(p: Pattern, block: Array | None, x: Array, axis: int = 0) -> Array:
+def multiply(p: Pattern, bands: Bands, x: Array, axis: int = 0) -> Array:
     """The matrix times `x`, (columns, ..., lanes), contracted over `axis` of `x`.
 
     With ``axis=1`` it is ``x @ matrix.T``.
     """
-    unknown = None
-    if block is not None and p.rows:
-        unknown = written_sum(
-            [_along(block[:, t], x, axis) * _one(x, col, axis) for t, col in enumerate(p.cols)]
-        )
+    products = [
+        stage(_band_times(band, cols, x, axis))
+        for band, (_, cols) in zip(bands, p.bands, strict=True)
+    ]
     pieces = []
     for start, stop in _segments(p):
         terms = []
@@ -136,9 +168,10 @@ def multiply(p: Pattern, block: Array | None, x: Array, axis: int = 0) -> Array:
             part = lax.slice_in_dim(x, int(col), int(col) + stop - start, axis=axis)
             value = p.base[start, col]
             terms.append(part if value == 1.0 else value * part)
-        if start in p.rows and unknown is not None:
-            at = p.rows.index(start)
-            terms.append(lax.slice_in_dim(unknown, at, at + stop - start, axis=axis))
+        for (rows, _), product in zip(p.bands, products, strict=True):
+            if start in rows:
+                at = rows.index(start)
+                terms.append(take(product, range(at, at + stop - start), axis))
         if not terms:
             shape = list(x.shape)
             shape[axis] = stop - start
@@ -147,40 +180,33 @@ def multiply(p: Pattern, block: Array | None, x: Array, axis: int = 0) -> Array:
     return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
 
 
-def row(p: Pattern, block: Array | None, index: int, x: Array, axis: int = 0) -> Array | None:
-    """One row of ``matrix @ x`` without the axis contracted; None where the row is known to be zero."""
-    terms = []
-    for col in np.flatnonzero(p.base[index]):
-        part = lax.index_in_dim(x, int(col), axis, keepdims=False)
-        value = p.base[index, col]
-        terms.append(part if value == 1.0 else value * part)
-    if block is not None and index in p.rows:
-        at = p.rows.index(index)
-        for t, col in enumerate(p.cols):
-            part = lax.index_in_dim(x, col, axis, keepdims=False)
-            factor = block[at, t]
-            terms.append(factor.reshape((1,) * (part.ndim - 1) + factor.shape) * part)
-    return written_sum(terms) if terms else None
-
-
-def _one(x: Array, index: int, axis: int) -> Array:
-    return lax.slice_in_dim(x, index, index + 1, axis=axis)
-
-
-def _along(column: Array, x: Array, axis: int) -> Array:
-    """A vector (rows, lanes) as an array of the rank of `x`, its rows on `axis`."""
-    shape = [1] * x.ndim
-    shape[axis], shape[-1] = column.shape
-    return column.reshape(shape)
+def _band_times(band: Array, cols: tuple[int, ...], x: Array, axis: int) -> Array:
+    """A band at `cols` times `x` (``x @ band.T`` with ``axis=1``), a run of columns at a time."""
+    terms, start = [], 0
+    for run in _runs(cols):
+        part = lax.slice_in_dim(x, run[0], run[-1] + 1, axis=axis)
+        block = lax.slice_in_dim(band, start, start + len(run), axis=1)
+        start += len(run)
+        if x.ndim == 2:
+            terms.append(folded_sum(block * along(part, block.shape, 1), 1))
+        elif axis == 0:
+            shape = (*block.shape[:2], *part.shape[1:])
+            terms.append(folded_sum(along(block, shape, 0, 1) * along(part, shape, 1, 2), 1))
+        else:
+            shape = (part.shape[0], *block.shape)
+            terms.append(folded_sum(along(part, shape, 0, 2) * along(block, shape, 1, 2), 2))
+    return written_sum(terms)
 
 
 def _segments(p: Pattern) -> list[tuple[int, int]]:
-    """Rows that are computed alike: all with unknowns or none, the known part moving with the row."""
+    """Rows that are computed alike: in the same bands, the known part moving with the row."""
     base = p.base
-    dense_rows = set(p.rows)
+
+    def bands_of(row: int) -> list[int]:
+        return [i for i, (rows, _) in enumerate(p.bands) if row in rows]
 
     def follows(row: int) -> bool:
-        if (row in dense_rows) != (row - 1 in dense_rows):
+        if bands_of(row) != bands_of(row - 1):
             return False
         before, here = np.flatnonzero(base[row - 1]), np.flatnonzero(base[row])
         return len(before) == len(here) and bool(
@@ -189,3 +215,47 @@ def _segments(p: Pattern) -> list[tuple[int, int]]:
 
     starts = [row for row in range(p.shape[0]) if row == 0 or not follows(row)]
     return list(zip(starts, [*starts[1:], p.shape[0]], strict=True))
+
+
+class Row:
+    """One row of a matrix: known numbers at some columns, and unknown ones, (columns, lanes), at others."""
+
+    def __init__(self, p: Pattern, bands: Bands, index: int) -> None:
+        self._size = p.shape[1]
+        self._known = [(int(c), float(p.base[index, c])) for c in np.flatnonzero(p.base[index])]
+        self.unknown: list[tuple[int, ...]] = []
+        """Columns of the unknown numbers, of each band."""
+        self._values: list[Array] = []
+        for (rows, cols), band in zip(p.bands, bands, strict=True):
+            if index in rows:
+                self.unknown.append(cols)
+                self._values.append(band[rows.index(index)])
+
+    def dot(self, vector: Array) -> Array:
+        """The row times a vector (n, lanes), (1, lanes)."""
+        terms = [_scaled(vector[c : c + 1], v) for c, v in self._known]
+        for cols, values in zip(self.unknown, self._values, strict=True):
+            terms.append(folded_sum(take(vector, cols, 0) * values, 0, keep=True))
+        return written_sum(terms) if terms else jnp.zeros_like(vector[:1])
+
+    def times(self, matrix: Array) -> Array:
+        """A matrix (n, n, lanes) times the row, (n, lanes)."""
+        terms = [_scaled(matrix[:, c], v) for c, v in self._known]
+        for cols, values in zip(self.unknown, self._values, strict=True):
+            part = take(matrix, cols, 1)
+            terms.append(folded_sum(part * along(values, part.shape, 1), 1))
+        return written_sum(terms) if terms else jnp.zeros_like(matrix[0])
+
+    def dense(self, like: Array) -> Array:
+        """The whole row, as an array like `like`, (n, lanes)."""
+        base = np.zeros((self._size, 1))
+        for column, value in self._known:
+            base[column] = value
+        total = jnp.broadcast_to(jnp.asarray(base, like.dtype), like.shape)
+        for cols, values in zip(self.unknown, self._values, strict=True):
+            total = total + _placed(values, cols, self._size, 0)
+        return total
+
+
+def _scaled(x: Array, value: float) -> Array:
+    return x if value == 1.0 else value * x

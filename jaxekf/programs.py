@@ -13,7 +13,8 @@ import numpy as np
 from jax.extend import core
 
 _REARRANGED = {"broadcast_in_dim", "reshape", "slice", "squeeze", "stack", "transpose", "unstack"}
-_INLINED = {"jit", "pjit", "closed_call", "core_call", "checkpoint", "remat"}
+_JITTED = {"jit", "pjit"}
+_INLINED = _JITTED | {"closed_call", "core_call", "checkpoint", "remat"}
 
 
 class Constant(NamedTuple):
@@ -31,6 +32,8 @@ class Operation(NamedTuple):
     outputs: tuple[int, ...]
     shapes: tuple[Any, ...]
     """Shape and dtype of each output."""
+    operands: tuple[Any, ...] = ()
+    """Shape and dtype of each input."""
 
     def bind(self, values: Sequence[Any]) -> list[Any]:
         """The outputs for the given operands."""
@@ -65,16 +68,43 @@ class Program(NamedTuple):
         return jax.tree.unflatten(self.tree, [read(o) for o in self.outputs])
 
 
-def trace(function: Callable[..., Any], *args: Any) -> Program:
-    """The operations of ``function(*args)``; its inputs are the leaves of `args` in order."""
+def trace(
+    function: Callable[..., Any], *args: Any, closed_calls: frozenset[str] = frozenset()
+) -> Program:
+    """The operations of ``function(*args)``; its inputs are the leaves of `args` in order.
+
+    Calls are replaced by what they do, but those of jitted functions named in `closed_calls`.
+    """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
     tree = jax.tree.structure(shapes)
+    return _program(closed.jaxpr, closed.consts, tree, closed_calls)
+
+
+def opened(operation: Operation, closed_calls: frozenset[str] = frozenset()) -> Program:
+    """What a call does, as a program whose outputs are a list."""
+    tree = jax.tree.structure([0] * len(operation.outputs))
+    return _program(*_called(operation.params), tree, closed_calls)
+
+
+def call_name(operation: Operation) -> str | None:
+    """Name of the jitted function that an operation calls; None for any other operation."""
+    return operation.params.get("name") if operation.primitive.name in _JITTED else None
+
+
+def _called(params: dict[str, Any]) -> tuple[Any, list[Any]]:
+    """The operations of a call, and their constants."""
+    found = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
+    return getattr(found, "jaxpr", found), list(getattr(found, "consts", ()))
+
+
+def _program(jaxpr: Any, consts: Any, tree: Any, closed_calls: frozenset[str]) -> Program:
     operations: list[Operation] = []
-    inputs = tuple(_spec(v) for v in closed.jaxpr.invars)
+    inputs = tuple(_spec(v) for v in jaxpr.invars)
     counter = [len(inputs)]
-    constants = [Constant(value) for value in closed.consts]
-    outputs = _flatten(closed.jaxpr, constants, list(range(len(inputs))), operations, counter)
-    return _without_dead(Program(inputs, tuple(operations), tuple(outputs), tree))
+    constants = [Constant(value) for value in consts]
+    numbers = list(range(len(inputs)))
+    outputs = _flatten(jaxpr, constants, numbers, operations, counter, closed_calls)
+    return without_dead(Program(inputs, tuple(operations), tuple(outputs), tree))
 
 
 def split(program: Program, first: int) -> tuple[Program, Program]:
@@ -98,7 +128,7 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
             before.append(operation)
         else:
             after.append(operation)
-    late = _without_dead(program._replace(operations=tuple(after))).operations
+    late = without_dead(program._replace(operations=tuple(after))).operations
     needed, moved = _frontier(program, late, early, made)
     places = {o.outputs[0] for o in after} | moved
     after = [o for o in program.operations if o.outputs[0] in places]
@@ -106,7 +136,7 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
     for operation in before:
         specs.update(zip(operation.outputs, operation.shapes, strict=True))
     tree = jax.tree.structure([0] * len(needed))
-    head = _without_dead(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
+    head = without_dead(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
     number = {old: new for new, old in enumerate(needed)}
     rest = range(first, len(program.inputs))
     number |= {old: len(needed) + i for i, old in enumerate(rest)}
@@ -120,7 +150,7 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
         outputs = tuple(number[o] for o in operation.outputs)
         renumbered.append(operation._replace(inputs=operands, outputs=outputs))
     outputs = tuple(o if isinstance(o, Constant) else number[o] for o in program.outputs)
-    return head, _without_dead(Program(inputs, tuple(renumbered), outputs, program.tree))
+    return head, without_dead(Program(inputs, tuple(renumbered), outputs, program.tree))
 
 
 def _frontier(
@@ -154,7 +184,12 @@ def _spec(variable: Any) -> jax.ShapeDtypeStruct:
 
 
 def _flatten(
-    jaxpr: Any, constants: list[Any], values: list[Any], operations: list[Operation], counter: list
+    jaxpr: Any,
+    constants: list[Any],
+    values: list[Any],
+    operations: list[Operation],
+    counter: list[int],
+    closed_calls: frozenset[str],
 ) -> list[Any]:
     """Append the operations of `jaxpr`, nested calls opened; the operands that are its outputs."""
     number = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *values], strict=True))
@@ -166,24 +201,24 @@ def _flatten(
 
     for eqn in jaxpr.eqns:
         operands = [read(atom) for atom in eqn.invars]
-        if eqn.primitive.name in _INLINED:
-            inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
-            consts = [Constant(c) for c in getattr(inner, "consts", ())]
-            inner = getattr(inner, "jaxpr", inner)
-            found = _flatten(inner, consts, operands, operations, counter)
+        name = eqn.primitive.name
+        closed = name in _JITTED and eqn.params.get("name") in closed_calls
+        if name in _INLINED and not closed:
+            inner, consts = _called(eqn.params)
+            fixed = [Constant(c) for c in consts]
+            found = _flatten(inner, fixed, operands, operations, counter, closed_calls)
         else:
             found = list(range(counter[0], counter[0] + len(eqn.outvars)))
             counter[0] += len(found)
             shapes = tuple(_spec(v) for v in eqn.outvars)
-            operation = Operation(
-                eqn.primitive, dict(eqn.params), tuple(operands), tuple(found), shapes
-            )
-            operations.append(operation)
+            given = tuple(_spec(atom) for atom in eqn.invars)
+            ends = (tuple(operands), tuple(found), shapes, given)
+            operations.append(Operation(eqn.primitive, dict(eqn.params), *ends))
         number.update(zip(eqn.outvars, found, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _without_dead(program: Program) -> Program:
+def without_dead(program: Program) -> Program:
     """The program without what no output needs."""
     needed = {o for o in program.outputs if not isinstance(o, Constant)}
     kept = []

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from jaxekf import kernels, linalg
+from jaxekf import linalg
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
 from jaxekf.own_derivative import inexact, merge, unfilled
@@ -23,9 +23,10 @@ from jaxekf.step import Moment, Outcome, Track, begin, predict, update
 from jaxekf.system import System
 
 _LARGEST_UNROLLED_SUBSTEPS = 2
-_CACHE_BYTES = 1 << 21
+_CACHE_BYTES = 1 << 20
 _MEMORY_BYTES = 1 << 32
-_SEGMENT = 16
+_BELIEFS_PER_STEP = 8
+_LONGEST_SEGMENT = 16
 
 
 class Given(NamedTuple):
@@ -150,28 +151,40 @@ def _scan(
         return lax.scan(epoch, track, given)[1], None
 
     def stretch(track: Track, given: Given) -> tuple[Track, tuple[Kept, Track]]:
-        if segment == 1:
-            after, kept = epoch(track, given)
-        else:
-            after, kept = lax.scan(epoch, track, given)
+        after, kept = lax.scan(epoch, track, given)
         return after, (kept, track)
 
     epochs = given.moments.dt.shape[0]
-    if segment > 1:
-        given = _cut(given, segment)
-    kept, starts = lax.scan(stretch, track, given)[1]
-    if segment > 1:
-        kept = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], kept)
-    return kept, starts
+    kept, starts = lax.scan(stretch, track, _cut(_filled(given, segment), segment))[1]
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], kept), starts
+
+
+def _filled(given: Given, segment: int) -> Given:
+    """`given` with inert steps at the end, so that segments divide it: no time passes and no row is visible.
+
+    All else is as at the last step, for a sampling period of zero, say, would divide the noise.
+    """
+    more = -given.moments.dt.shape[0] % segment
+    if not more:
+        return given
+
+    def hidden(samples: Any) -> Any:
+        return {
+            name: rows._replace(mask=jnp.zeros_like(rows.mask)) for name, rows in samples.items()
+        }
+
+    last = jax.tree.map(lambda a: jnp.broadcast_to(a[-1:], (more, *a.shape[1:])), given)
+    still = last.moments._replace(dt=jnp.zeros_like(last.moments.dt))
+    inert = Given(still, hidden(last.fast), hidden(last.slow))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), given, inert)
 
 
 def _cut(tree: Any, segment: int) -> Any:
-    """Arrays (K, ...) in segments (K / segment, segment, ...), the last filled with inert steps."""
+    """Arrays (K, ...) in segments (K / segment, segment, ...), the last filled with zeros."""
 
     def cut(a: Array) -> Array:
         more = -a.shape[0] % segment
         if more:
-            # Zeros are inert: no time passes and no row is visible.
             a = jnp.concatenate([a, jnp.zeros((more, *a.shape[1:]), a.dtype)])
         return a.reshape(-1, segment, *a.shape[1:])
 
@@ -207,56 +220,68 @@ def _scan_back(
 ) -> tuple[Any, Belief, list[Array]]:
     """Cotangents of what was prepared, of the first belief, and of the moving leaves of `given`.
 
-    `cotangents` are those of the live leaves of `Kept`; the others have none.
+    `cotangents` are those of the live leaves of `Kept`; the others have none. A segment is filtered again from
+    its start, and what the derivative of each epoch needs is kept until the way back through it.
     """
-    leaves, tree = jax.tree.flatten(given)
-    floats, moving_prepared = inexact(prepared)
-
-    def back(carry: Any, at: Any) -> Any:
-        after, total = carry
-        start, leaves, cotangents = at
-
-        def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
-            full = merge(moving, moved, leaves)
-            values = moving_prepared(floats)
-            track, kept = _epoch(system, what, True, values, track, jax.tree.unflatten(tree, full))
-            return track, [v for f, v in zip(live, jax.tree.leaves(kept), strict=True) if f]
-
-        moved = [v for f, v in zip(moving, leaves, strict=True) if f]
-        _, pull = jax.vjp(forward, floats, start, moved)
-        gained, before, of_given = pull((after, cotangents))
-        return (before, jax.tree.map(jnp.add, total, gained)), of_given
-
-    zero = jax.tree.map(lambda a: jnp.zeros(a.shape[1:], a.dtype), starts)
-    carry = (zero, jax.tree.map(jnp.zeros_like, floats))
-    if segment == 1:
-        given_back = (starts, leaves, cotangents)
-        (first, total), of_given = lax.scan(back, carry, given_back, reverse=True)
-        return total, first.belief, of_given
     epochs = given.moments.dt.shape[0]
-    ahead = partial(_epoch, system, What(False, False, False), False, prepared)
+    every, tree = jax.tree.flatten(_filled(given, segment))
+    floats, moving_prepared = inexact(prepared)
+    pulls = _Pulls()
 
     def stretch(carry: Any, at: Any) -> Any:
         start, leaves, cotangents = at
 
-        def step(track: Track, given: Given) -> tuple[Track, Track]:
-            return ahead(track, given)[0], track
+        def step(track: Track, leaves: list[Array]) -> tuple[Track, list[Array]]:
+            def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
+                full = jax.tree.unflatten(tree, merge(moving, moved, leaves))
+                track, kept = _epoch(system, what, True, moving_prepared(floats), track, full)
+                live_kept = zip(live, jax.tree.leaves(kept), strict=True)
+                return (track, [v for f, v in live_kept if f])
 
-        _, tracks = lax.scan(step, start, jax.tree.unflatten(tree, leaves))
-        return lax.scan(back, carry, (tracks, leaves, cotangents), reverse=True)
+            moved = [v for f, v in zip(moving, leaves, strict=True) if f]
+            (track, _), pull = jax.vjp(forward, floats, track, moved)
+            return track, pulls.opened(pull, jax.tree.leaves(prepared), leaves)
 
-    pieces = (starts, _cut(leaves, segment), _cut(cotangents, segment))
+        def back(carry: Any, at: Any) -> Any:
+            after, total = carry
+            saved, leaves, cotangents = at
+            pull = pulls.closed(saved, jax.tree.leaves(prepared), leaves)
+            gained, before, of_given = pull((after, cotangents))
+            return (before, jax.tree.map(jnp.add, total, gained)), of_given
+
+        _, saved = lax.scan(step, start, leaves)
+        return lax.scan(back, carry, (saved, leaves, cotangents), reverse=True)
+
+    zero = jax.tree.map(lambda a: jnp.zeros(a.shape[1:], a.dtype), starts)
+    carry = (zero, jax.tree.map(jnp.zeros_like, floats))
+    pieces = (starts, _cut(every, segment), _cut(cotangents, segment))
     (first, total), of_given = lax.scan(stretch, carry, pieces, reverse=True)
     of_given = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], of_given)
     return total, first.belief, of_given
 
 
+class _Pulls:
+    """The pullback of an epoch as arrays that a scan can hand over, without those that both sides have."""
+
+    def __init__(self) -> None:
+        self._tree: Any = None
+        self._places: list[tuple[int, int] | None] = []
+
+    def opened(self, pull: Any, *shared: list[Array]) -> list[Array]:
+        """The arrays that `pull` holds and none of the lists `shared` does."""
+        places = {id(a): (i, k) for i, own in enumerate(shared) for k, a in enumerate(own)}
+        leaves, self._tree = jax.tree.flatten(pull)
+        self._places = [places.get(id(leaf)) for leaf in leaves]
+        return [leaf for leaf, at in zip(leaves, self._places, strict=True) if at is None]
+
+    def closed(self, saved: list[Array], *shared: list[Array]) -> Any:
+        """The pullback, from what `opened` gave and the same lists."""
+        own = iter(saved)
+        leaves = [next(own) if at is None else shared[at[0]][at[1]] for at in self._places]
+        return jax.tree.unflatten(self._tree, leaves)
+
+
 # --- all runs -----------------------------------------------------------------------------------------
-
-
-def _whole(system: System, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as one piece of code where the model allows it."""
-    return partial(kernels.block, function) if system.is_plain else function
 
 
 def filter_plainly(
@@ -294,7 +319,7 @@ def _with_adjoint(
         def scan(_: None, *trees: Any) -> Any:
             return _scan(system, what, False, segment, *trees)
 
-        kept, starts = in_blocks(devices, _whole(system, scan), None, *trees)
+        kept, starts = in_blocks(devices, scan, None, *trees)
         if segment is None:
             return kept, None
         return kept, Blocks(starts, jnp.zeros(jax.tree.leaves(trees)[0].shape[0]))
@@ -357,7 +382,7 @@ def _backward(
             return jnp.zeros((count, *a.shape[1:-1], size), a.dtype)
 
         arrays = jax.tree.map(fitting, starts.arrays)
-        return in_blocks(devices, _whole(system, scan), arrays, *trees)
+        return in_blocks(devices, scan, arrays, *trees)
 
     return over_more_runs(devices, run)
 
@@ -376,12 +401,14 @@ def _symmetric(cotangents: Kept) -> Kept:
     return cotangents._replace(prior=prior, cov=symmetric(cotangents.cov))
 
 
-def segment_length(epochs: int, bytes_per_epoch: int) -> int:
+def segment_length(epochs: int, substeps: int, bytes_per_belief: int) -> int:
     """Epochs between kept beliefs.
 
-    All are kept while they fit into the second cache. Beyond it to compute them again, a few at a time,
-    is quicker than to write and read them; with very many epochs it also bounds the memory.
+    What the derivatives of the epochs of a segment need, about `_BELIEFS_PER_STEP` beliefs a substep, should
+    stay in the second cache; with very many epochs the beliefs kept should not fill the memory.
     """
-    if epochs * bytes_per_epoch <= _CACHE_BYTES:
-        return 1
-    return max(_SEGMENT, math.isqrt(epochs) if epochs * bytes_per_epoch > _MEMORY_BYTES else 0)
+    fitting = _CACHE_BYTES // (_BELIEFS_PER_STEP * substeps * bytes_per_belief)
+    segment = min(max(fitting, 2), _LONGEST_SEGMENT)
+    if epochs * bytes_per_belief > segment * _MEMORY_BYTES:
+        segment = max(segment, math.isqrt(epochs))
+    return segment

@@ -17,10 +17,10 @@ from jax import Array
 from jaxekf import algebra, linalg
 from jaxekf.about import AboutSystem
 from jaxekf.algebra import Gained
-from jaxekf.kernels import loop
+from jaxekf.lanes import stage
 from jaxekf.model import Belief
 from jaxekf.outliers import Linear
-from jaxekf.step import any_used, blocks_of_rows, hide, take_block
+from jaxekf.step import any_used, hide, take_block
 from jaxekf.system import System
 
 
@@ -33,11 +33,6 @@ class Again:
     def prepare(self, params: Any) -> Any:
         """What it needs of the parameters, for one run."""
         return self._system.prepare(params)
-
-    @property
-    def is_plain(self) -> bool:
-        """As `System.is_plain`."""
-        return self._system.is_plain
 
     def __call__(
         self,
@@ -61,12 +56,12 @@ class Again:
             away, changed = self._system.start(prepared["start"], prior.mean, x, adjoint=adjoint)
             before = Gained(
                 turned(changed, prior.cov),
-                -loop(algebra.apply, changed, away),
+                -stage(algebra.apply(changed, away)),
                 jnp.zeros(lanes, dtype),
             )
             rows = self._looked(prepared, x, u, samples, linear, adjoint)
-            for slope, block in blocks_of_rows(self._system.measurements, rows):
-                before, pivot = take_block(slope, before, block, adjoint)
+            for one in rows.values():
+                before, pivot = take_block(one.slope, before, one.rows, adjoint)
                 smallest = jnp.minimum(smallest, pivot)
             moved, reset = self._system.move(prepared["move"], x, before.delta, adjoint=adjoint)
             posterior = Belief(moved, turned(reset, before.cov))
@@ -110,5 +105,5 @@ def _where(used: Array, a: Belief, b: Belief) -> Belief:
 
 def turned(matrix: Array, cov: Array) -> Array:
     """``M P M'``."""
-    half = loop(algebra.product, matrix, cov)
-    return loop(lambda h, m: linalg.symmetrise(algebra.product_transposed(h, m)), half, matrix)
+    half = stage(algebra.product(matrix, cov))
+    return stage(linalg.symmetrise(algebra.product_transposed(half, matrix)))

@@ -6,9 +6,40 @@ Rotation vectors are in radians. Every function works on the last axis and broad
 silently; gradients, also second ones, are finite everywhere, the zero rotation included.
 """
 
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+GROUP_CALLS: set[str] = set()
+"""Names, in a traced program, of the functions that `jaxekf.group_derivative` knows a derivative of."""
+
+
+def _group(function: _F) -> _F:
+    """The function as one operation of a traced program, recognisable by its name."""
+    name = f"jaxekf.rotation.{function.__name__}"
+    GROUP_CALLS.add(name)
+
+    def call(*args: Any) -> Any:
+        return function(*args)
+
+    call.__name__ = call.__qualname__ = name
+    jitted: Any = jax.jit(call)
+
+    @functools.wraps(function)
+    def marked(*args: Any) -> Any:
+        return jitted(*args)
+
+    return marked  # pyright: ignore[reportReturnType]
+
+
+_SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).swapaxes(1, 2)
 
 # Below these squared sizes the series are exact to rounding, value and two derivatives, so that the
 # closed forms (which divide by the size) are never evaluated where they are 0/0.
@@ -29,31 +60,37 @@ def identity() -> Array:
     return jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
+@_group
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors, shapes (..., 3)."""
+    return _rolled(a, 1) * _rolled(b, 2) - _rolled(a, 2) * _rolled(b, 1)
+
+
+def _rolled(vector: Array, by: int) -> Array:
+    return jnp.concatenate([vector[..., by:], vector[..., :by]], axis=-1)
+
+
+@_group
 def product(p: Array, q: Array) -> Array:
     """Hamilton product ``p * q`` of quaternions, shapes (..., 4)."""
-    pw, px, py, pz = (p[..., i] for i in range(4))
-    qw, qx, qy, qz = (q[..., i] for i in range(4))
-    return jnp.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
+    real = pw * qw - jnp.sum(pv * qv, axis=-1, keepdims=True)
+    return jnp.concatenate([real, pw * qv + qw * pv + cross(pv, qv)], axis=-1)
 
 
+@_group
 def conjugate(q: Array) -> Array:
     """Inverse of a unit quaternion, shape (..., 4)."""
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
+@_group
 def normalise(q: Array) -> Array:
     """``q`` scaled to unit norm, shape (..., 4); ``q`` must not be zero."""
     return q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
 
 
+@_group
 def keep_unit(q: Array) -> Array:
     """``q``, of unit norm but for rounding, scaled back to it: one Newton step, no division."""
     return q * (1.5 - 0.5 * jnp.sum(q * q, axis=-1, keepdims=True))
@@ -90,12 +127,14 @@ def _half_angle(delta: Array) -> tuple[Array, Array]:
     )
 
 
+@_group
 def exp(delta: Array) -> Array:
     """Quaternion of the rotation vector ``delta`` in radians, shapes (..., 3) to (..., 4)."""
     cosine, sine = _half_angle(delta)
     return jnp.concatenate([cosine[..., None], sine[..., None] * delta], axis=-1)
 
 
+@_group
 def log(q: Array) -> Array:
     """Rotation vector in radians, of length at most pi, shapes (..., 4) to (..., 3).
 
@@ -117,27 +156,28 @@ def log(q: Array) -> Array:
     return factor[..., None] * vector
 
 
+@_group
 def rotate(q: Array, vector: Array) -> Array:
     """``vector`` turned by ``q``: body coordinates to reference coordinates, shapes (..., 4), (..., 3)."""
     imaginary = q[..., 1:]
-    twice_cross = 2.0 * jnp.cross(imaginary, vector)
-    return vector + q[..., :1] * twice_cross + jnp.cross(imaginary, twice_cross)
+    twice_cross = 2.0 * cross(imaginary, vector)
+    return vector + q[..., :1] * twice_cross + cross(imaginary, twice_cross)
 
 
+@_group
 def rotate_inverse(q: Array, vector: Array) -> Array:
     """``vector`` turned by the inverse of ``q``: reference coordinates to body coordinates."""
     return rotate(conjugate(q), vector)
 
 
+@_group
 def to_matrix(q: Array) -> Array:
     """Rotation matrix ``R`` with ``v_ref = R @ v_body``, shapes (..., 4) to (..., 3, 3)."""
-    w, x, y, z = (q[..., i] for i in range(4))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    w, v = q[..., :1, None], q[..., 1:]
+    outer = v[..., :, None] * v[..., None, :]
+    real = 1.0 - 2.0 * jnp.sum(v * v, axis=-1)[..., None, None]
+    identity = jnp.eye(3, dtype=q.dtype).reshape((1,) * (q.ndim - 1) + (3, 3))
+    return real * identity + 2.0 * (outer + w * skew(v))
 
 
 def from_matrix(matrix: Array) -> Array:
@@ -163,6 +203,7 @@ def from_matrix(matrix: Array) -> Array:
     return jnp.where(q[..., :1] < 0.0, -q, q)
 
 
+@_group
 def align(q: Array, near: Array) -> Array:
     """``q`` or ``-q``, whichever is nearer to the quaternion `near`, shapes (..., 4)."""
     return jnp.where(jnp.sum(q * near, axis=-1, keepdims=True) < 0.0, -q, q)
@@ -174,28 +215,47 @@ def difference(q: Array, r: Array) -> Array:
 
 
 def skew(vector: Array) -> Array:
-    """Matrix of the cross product, ``skew(a) @ b == cross(a, b)``, shapes (3,) to (3, 3)."""
-    x, y, z = vector
-    zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    """Matrix of the cross product, ``skew(a) @ b == cross(a, b)``, shapes (..., 3) to (..., 3, 3)."""
+    return jnp.tensordot(vector, jnp.asarray(_SKEW, vector.dtype), axes=1)
 
 
 def right_jacobian(delta: Array) -> Array:
-    """``J`` with ``exp(delta + e) ~ exp(delta) * exp(J @ e)``, shapes (3,) to (3, 3)."""
+    """``J`` with ``exp(delta + e) ~ exp(delta) * exp(J @ e)``, shapes (3,) to (3, 3).
+
+    ``I - (1 - cos a) / a^2 [delta] + (a - sin a) / a^3 [delta]^2`` (Sola, Deray, Atchuthan 2018, eq. 143),
+    by half the angle, as `exp` has it: ``1 - cos a = 2 sin^2(a / 2)``, ``sin a = 2 sin(a / 2) cos(a / 2)``.
+    """
+    cosine, sine = _half_angle(delta)
     squared = jnp.sum(delta * delta)
     small = squared < _SMALL_ANGLE_SQUARED
-    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
-    inverse = _reciprocal(angle)
     series = jnp.where(small, squared, 0.0)
-    first = jnp.where(
-        small,
-        _polynomial(series, (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800)),
-        (1.0 - jnp.cos(angle)) * inverse * inverse,
-    )
     second = jnp.where(
         small,
         _polynomial(series, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)),
-        (angle - jnp.sin(angle)) * inverse * inverse * inverse,
+        (1.0 - 2.0 * sine * cosine) * _reciprocal(jnp.where(small, 1.0, squared)),
     )
-    cross = skew(delta)
-    return jnp.eye(3, dtype=delta.dtype) - first * cross + second * (cross @ cross)
+    return _with_skew(delta, -2.0 * sine * sine, second)
+
+
+def inverse_right_jacobian(delta: Array) -> Array:
+    """Inverse of `right_jacobian`, for vectors up to half a turn, shapes (3,) to (3, 3).
+
+    ``I + [delta] / 2 + (1 - (a / 2) cot(a / 2)) / a^2 [delta]^2`` (Sola, Deray, Atchuthan 2018, eq. 144).
+    """
+    cosine, sine = _half_angle(delta)
+    squared = jnp.sum(delta * delta)
+    small = squared < _SMALL_ANGLE_SQUARED
+    series = jnp.where(small, squared, 0.0)
+    second = jnp.where(
+        small,
+        _polynomial(series, (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)),
+        (1.0 - 0.5 * cosine * _reciprocal(sine)) * _reciprocal(jnp.where(small, 1.0, squared)),
+    )
+    return _with_skew(delta, 0.5 * jnp.ones_like(squared), second)
+
+
+def _with_skew(delta: Array, first: Array, second: Array) -> Array:
+    """``I + first [delta] + second [delta]^2``, where ``[delta]^2 = delta delta' - |delta|^2 I``."""
+    real = 1.0 - second * jnp.sum(delta * delta)
+    outer = delta[:, None] * delta[None]
+    return real * jnp.eye(3, dtype=delta.dtype) + second * outer + first * skew(delta)

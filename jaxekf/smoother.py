@@ -75,4 +75,4 @@ def run_smoother_batch(
 @lru_cache(maxsize=64)
 def _lanes(system: System, devices: tuple[Any, ...]) -> Any:
     scan = partial(backward.scan_back, system, True)
-    return own_derivative.with_own_derivative(devices, system.is_plain, scan)
+    return own_derivative.with_own_derivative(devices, scan)

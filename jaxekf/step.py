@@ -12,12 +12,9 @@ from jaxekf import algebra, linalg, many, outliers, patterned
 from jaxekf.algebra import Gained
 from jaxekf.model import Belief
 from jaxekf.outliers import Judged, Linear
-from jaxekf.patterned import Pattern
+from jaxekf.patterned import Bands, Pattern
 from jaxekf.system import Measurement, System
 from jaxekf.timeline import Rows
-
-_LARGEST_BLOCK = 7
-
 
 class Moment(NamedTuple):
     """What a substep is given besides samples."""
@@ -67,17 +64,14 @@ def predict(
     derivative is JAX's own.
     """
     transition = system.transition
-    mean, f, g, sigma = transition.piece(
+    mean, f, g = transition.piece(
         prepared["transition"], belief.mean, moment.u, moment.dt, adjoint=adjoint
     )
-    cov = _congruence(transition.state, f, belief.cov, adjoint)
-    if not transition.noise.is_identity:
-        sigma = algebra.on_diagonal(sigma) if transition.diagonal else sigma
-        return Belief(mean, cov + _congruence(transition.noise, g, sigma, adjoint))
-    if transition.diagonal:
-        add = algebra.add_on_diagonal_with_adjoint if adjoint else algebra.add_on_diagonal
-        return Belief(mean, add(cov, sigma))
-    return Belief(mean, cov + linalg.symmetrise(sigma))
+    (sigma,) = transition.sigma(prepared["process noise"], moment.dt, adjoint=adjoint)
+    patterns = (transition.state, transition.noise)
+    if adjoint:
+        return Belief(mean, algebra.predicted_with_adjoint(*patterns)(f, g, belief.cov, sigma))
+    return Belief(mean, algebra.predicted(*patterns, f, g, belief.cov, sigma))
 
 
 def update(
@@ -102,8 +96,8 @@ def update(
         return Outcome(prior, ahead, nothing, sound, used, gated, never)
     gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
-    for slope, rows in blocks_of_rows(system.measurements, linear):
-        gained, pivot = take_block(slope, gained, rows, adjoint)
+    for one in linear.values():
+        gained, pivot = take_block(one.slope, gained, one.rows, adjoint)
         smallest = jnp.minimum(smallest, pivot)
     posterior = _correct(system, prepared["correction"], prior, gained, any_used(linear), adjoint)
     if system.again is not None:
@@ -150,16 +144,10 @@ def _is_sound(cov: Array) -> Array:
     return (smallest >= 0.0) & (largest < jnp.inf)
 
 
-def _congruence(p: Pattern, block: Array | None, cov: Array, adjoint: bool) -> Array:
-    if adjoint:
-        return algebra.congruence_with_adjoint(p)(block, cov)
-    return algebra.congruence(p, block, cov)[0]
-
-
 def hide(
-    measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
+    measurement: Measurement, residual: Array, slope: Bands, noise: Array, mask: Array
 ) -> Linear:
-    """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
+    """Hidden rows made inert: no slope and unit noise, whatever their numbers are."""
     if many.are_many(residual):
         mask = mask.reshape(residual.shape)
         hidden = jax.vmap(partial(_hide, measurement))(residual, slope, noise, mask)
@@ -169,20 +157,20 @@ def hide(
 
 
 def _hide(
-    measurement: Measurement, residual: Array, slope: Array | None, noise: Array, mask: Array
+    measurement: Measurement, residual: Array, slope: Bands, noise: Array, mask: Array
 ) -> algebra.Rows:
-    if slope is not None:
-        rows = patterned.take(mask, measurement.slope.rows, 0)
-        slope = jnp.where(rows[:, None], slope, 0.0)
+    bands = [
+        jnp.where(patterned.take(mask, rows, 0)[:, None], band, 0.0)
+        for band, (rows, _) in zip(slope, measurement.slope.bands, strict=True)
+    ]
     both = mask if measurement.diagonal else mask[:, None] & mask[None]
-    noise = jnp.where(both, noise, 0.0)
-    return algebra.Rows(residual, slope, noise, mask)
+    return algebra.Rows(residual, tuple(bands), jnp.where(both, noise, 0.0), mask)
 
 
 def take_block(
     slope: Pattern, gained: Gained, rows: algebra.Rows, adjoint: bool
 ) -> tuple[Gained, Array]:
-    """A block of rows taken at once, and the smallest pivot met."""
+    """A block of rows taken, and the smallest variance of an innovation met."""
     if many.are_many(rows.mask):
 
         def one(carry: tuple[Gained, Array], rows: algebra.Rows) -> tuple[Any, None]:
@@ -192,69 +180,22 @@ def take_block(
             return (gained, jnp.minimum(carry[1], pivot)), None
 
         return lax.scan(one, (gained, jnp.ones_like(gained.log_likelihood)), rows)[0]
+    if rows.noise.ndim == 3:
+        more = algebra.whitening_likelihood(rows)
+        gained = gained._replace(log_likelihood=gained.log_likelihood + more)
+    slope, rows = algebra.whitened(slope, rows)
     if adjoint:
-        return algebra.update_with_adjoint(slope, rows.noise.ndim == 2)(gained, rows)
+        return algebra.update_with_adjoint(slope)(gained, rows)
     return algebra.update(slope, gained, rows)
 
 
 def take_keeping(slope: Pattern, gained: Gained, rows: algebra.Rows) -> tuple[Gained, Any]:
-    """A block of rows taken at once, and what the way back through it needs."""
+    """A block of rows taken, and what the way back through it needs."""
     if many.are_many(rows.mask):
         return lax.scan(lambda gained, rows: take_keeping(slope, gained, rows), gained, rows)
-    gained, _, solved = algebra.take(slope, gained, rows, with_inverse=True)
-    return gained, solved
-
-
-def blocks_of_rows(
-    measurements: dict[str, Measurement], linear: dict[str, Linear]
-) -> list[tuple[Pattern, algebra.Rows]]:
-    """Rows in blocks that are taken at once: whole sensors together while they are small."""
-    groups: list[list[str]] = []
-    size = 0
-    for name, one in linear.items():
-        rows = one.slope.shape[0]
-        if many.are_many(one.rows.mask):
-            rows = _LARGEST_BLOCK + 1  # Groups that are taken one after the other stand alone.
-        if groups and size + rows <= _LARGEST_BLOCK:
-            groups[-1].append(name)
-            size += rows
-        else:
-            groups.append([name])
-            size = rows
-    return [_joined(measurements, [linear[name] for name in names], names) for names in groups]
-
-
-def _joined(
-    measurements: dict[str, Measurement], parts: list[Linear], names: list[str]
-) -> tuple[Pattern, algebra.Rows]:
-    """Rows of several sensors as one block."""
-    if len(parts) == 1:
-        return parts[0].slope, parts[0].rows
-    slope = patterned.stack([part.slope for part in parts])
-    residual = jnp.concatenate([part.rows.residual for part in parts])
-    mask = jnp.concatenate([part.rows.mask for part in parts])
-    lanes, dtype = residual.shape[-1], residual.dtype
-    unknown = None
-    if slope.rows:
-        whole = [patterned.dense(p.slope, p.rows.slope, lanes, dtype) for p in parts]
-        stacked = patterned.take(jnp.concatenate(whole), slope.rows, 0)
-        unknown = patterned.take(stacked, slope.cols, 1)
-    if all(measurements[name].diagonal for name in names):
-        noise = jnp.concatenate([part.rows.noise for part in parts])
-    else:
-        noise = _block_diagonal([part.rows.noise for part in parts])
-    return slope, algebra.Rows(residual, unknown, noise, mask)
-
-
-def _block_diagonal(matrices: list[Array]) -> Array:
-    whole = [algebra.on_diagonal(m) if m.ndim == 2 else m for m in matrices]
-    size, start, rows = sum(m.shape[0] for m in whole), 0, []
-    for m in whole:
-        before = jnp.zeros((m.shape[0], start, m.shape[-1]), m.dtype)
-        after = jnp.zeros((m.shape[0], size - start - m.shape[0], m.shape[-1]), m.dtype)
-        rows.append(jnp.concatenate([before, m, after], axis=1))
-        start += m.shape[0]
-    return jnp.concatenate(rows)
+    slope, rows = algebra.whitened(slope, rows)
+    gained, _, taken = algebra.take(slope, gained, rows)
+    return gained, (rows, taken)
 
 
 def any_used(linear: dict[str, Linear]) -> Array:
@@ -271,5 +212,7 @@ def _correct(
     if correction.reset.is_identity:
         # Symmetric but for rounding, which the next prediction ends.
         return Belief(mean, gained.cov)
-    cov = _congruence(correction.reset, reset, gained.cov, adjoint)
-    return Belief(mean, cov)
+    turn = partial(algebra.congruence, correction.reset)
+    if adjoint:
+        turn = algebra.congruence_with_adjoint(correction.reset)
+    return Belief(mean, turn(reset, gained.cov))

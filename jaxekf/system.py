@@ -3,6 +3,7 @@
 All of it is found from the model's functions when a program is traced; a model declares nothing.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -13,9 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxekf import linalg, linearise, manifold, many, patterned, programs, scalars, structure
+from jaxekf import lanes, linearise, manifold, many, patterned, programs, structure
+from jaxekf.errors import SlowModelWarning
+from jaxekf.linearise import Jacobian
 from jaxekf.model import Model, Sensor
-from jaxekf.patterned import Pattern
+from jaxekf.patterned import Bands, Pattern
 from jaxekf.programs import Program
 from jaxekf.timeline import Rows
 
@@ -23,18 +26,11 @@ from jaxekf.timeline import Rows
 class Piece:
     """A function of one run, split into what depends on the parameters only and what is done each step."""
 
-    is_plain: bool
-    """Whether the work of a step is arithmetic only."""
-
     def __init__(self, function: Callable[..., Any], params: Any, *rest: Any) -> None:
-        program = programs.trace(function, params, *rest)
-        self._head, body = programs.split(program, len(jax.tree.leaves(params)))
-        count = len(self._head.outputs)
-        numbers, self.is_plain = scalars.numbers_of(body)
-        # Through an operation that is not taken apart anything may be used.
-        every = [sorted(np.ndindex(*spec.shape)) for spec in body.inputs[:count]]
-        self._used = scalars.used(numbers, count) if self.is_plain else every
-        self._body = _compact(body, count, self._used)
+        program = structure.simplified(programs.trace(function, params, *rest))
+        self._head, self._body = programs.split(program, len(jax.tree.leaves(params)))
+        self.unlisted = lanes.unlisted(self._body)
+        """Operations of a step that are not plain arithmetic."""
         self._on_lanes = partial(_on_lanes, self._body)
         self._pullback: Program | None = None
         self._with_adjoint = jax.custom_vjp(self._on_lanes)
@@ -42,12 +38,7 @@ class Piece:
 
     def prepare(self, params: Any) -> tuple[Array, ...]:
         """What the steps need of the parameters, for one run; differentiable and cheap."""
-        values = self._head.evaluate(jax.tree.leaves(params))
-        return tuple(
-            jnp.stack([value[index] for index in used])
-            for value, used in zip(values, self._used, strict=True)
-            if used
-        )
+        return tuple(self._head.evaluate(jax.tree.leaves(params)))
 
     def __call__(self, prepared: Any, *rest: Any, adjoint: bool = False) -> Any:
         """The function on lanes; with `adjoint` its reverse derivative is one on lanes too."""
@@ -59,38 +50,15 @@ class Piece:
         inexact = [jnp.issubdtype(spec.dtype, jnp.inexact) for spec in self._body.inputs]
         if self._pullback is None:
             self._pullback = _pullback(self._body, inexact)
-        found = scalars.evaluate(self._pullback, [*values, *cotangents])
-        found = iter(found)
+        found = iter(lanes.stage(lanes.evaluate(self._pullback, [*values, *cotangents])))
         return tuple(
             next(found) if flag else np.zeros(value.shape, jax.dtypes.float0)
             for flag, value in zip(inexact, values, strict=True)
         )
 
 
-def _compact(body: Program, count: int, used: list[list[tuple[int, ...]]]) -> Program:
-    """The body with only the numbers that are used in place of each of its first `count` inputs."""
-    specs = [
-        jax.ShapeDtypeStruct((len(indices),), spec.dtype)
-        for spec, indices in zip(body.inputs[:count], used, strict=True)
-        if indices
-    ]
-
-    def function(*values: Any) -> Any:
-        given = iter(values)
-        full = []
-        for spec, indices in zip(body.inputs[:count], used, strict=True):
-            known: Any = next(given) if indices else ()
-            numbers = [jnp.zeros((), spec.dtype)] * int(np.prod(spec.shape, dtype=int))
-            for at, index in enumerate(indices):
-                numbers[int(np.ravel_multi_index(index, spec.shape)) if index else 0] = known[at]
-            full.append(jnp.stack(numbers).reshape(spec.shape))
-        return body.evaluate([*full, *given])
-
-    return programs.trace(function, *specs, *body.inputs[count:])
-
-
 def _on_lanes(body: Program, *values: Array) -> list[Array]:
-    return jax.tree.leaves(scalars.evaluate(body, values))
+    return lanes.stage(jax.tree.leaves(lanes.evaluate(body, values)))
 
 
 def _pullback(body: Program, inexact: list[bool]) -> Program:
@@ -109,14 +77,16 @@ def _pullback(body: Program, inexact: list[bool]) -> Program:
         return list(jax.vjp(function, *moving)[1](list(cotangents)))
 
     outputs = jax.eval_shape(lambda *v: jax.tree.leaves(body.evaluate(v)), *body.inputs)
-    return programs.trace(pull, *body.inputs, *outputs)
+    return structure.simplified(programs.trace(pull, *body.inputs, *outputs))
 
 
 class Transition(NamedTuple):
     """The transition's mean, Jacobians and noise, and what is known of them."""
 
     piece: Piece
-    """``(params, x, u, dt)`` to the mean, the unknown blocks of F and G, and the noise."""
+    """``(params, x, u, dt)`` to the mean and the unknown bands of F and G."""
+    sigma: Piece
+    """``(params, dt)`` to the process noise, as a list of one."""
     state: Pattern
     noise: Pattern
     diagonal: bool
@@ -128,14 +98,14 @@ class Measurement(NamedTuple):
 
     sensor: Sensor
     piece: Piece
-    """``(params, x, u, rows)`` to the residual, the unknown block of H, and the noise."""
+    """``(params, x, u, rows)`` to the residual, the unknown bands of H, and the noise."""
     slope: Pattern
     diagonal: bool
 
     def __call__(
         self, constants: Any, x: Any, u: Any, rows: Rows, *, adjoint: bool
-    ) -> tuple[Array, Array | None, Array]:
-        """Residual, unknown block of the slope, and noise of a sample on lanes.
+    ) -> tuple[Array, Bands, Array]:
+        """Residual, unknown bands of the slope, and noise of a sample on lanes.
 
         Of a sample that is made of like groups each of them has the groups on its first axis.
         """
@@ -154,7 +124,7 @@ class Correction(NamedTuple):
     """How an error vector moves the mean, and how the covariance follows."""
 
     piece: Piece
-    """``(params, x, delta, any_used)`` to the mean, the unknown block of the reset Jacobian, and how
+    """``(params, x, delta, any_used)`` to the mean, the unknown bands of the reset Jacobian, and how
     far, as an error vector, the model's constraint moved the mean; None without one."""
     reset: Pattern
 
@@ -174,6 +144,7 @@ class System:
         """What the steps need of the parameters, for one run."""
         found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
         found["transition"] = self.transition.piece.prepare(params)
+        found["process noise"] = self.transition.sigma.prepare(params)
         found["correction"] = self.correction.piece.prepare(params)
         if self.again is not None:
             found["again"] = self.again.prepare(params)
@@ -183,13 +154,6 @@ class System:
     def is_gated(self) -> bool:
         """Whether any sensor has a gate."""
         return any(m.sensor.gate is not None for m in self.measurements.values())
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether all functions of the model are arithmetic only, so that all steps are one program."""
-        pieces = [m.piece for m in self.measurements.values()]
-        pieces += [self.transition.piece, self.correction.piece]
-        return all(p.is_plain for p in pieces) and (self.again is None or self.again.is_plain)
 
 
 def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:
@@ -216,42 +180,63 @@ def _build(model: Model, leaves: Any, tree: Any) -> System:
     )
 
 
-def cut(matrix: Array, p: Pattern) -> Array | None:
-    """The unknown block of a whole matrix."""
-    if not p.rows:
-        return None
-    return patterned.take(patterned.take(matrix, p.rows, 0), p.cols, 1)
-
-
-def known(function: Callable[..., Any], *args: Any) -> Any:
-    return structure.find(programs.trace(function, *args))
+def warn_of(model: Model, what: str, left: tuple[str, ...], piece: Piece) -> None:
+    """Tell, once, which operations of a model's function make it slow."""
+    if left:
+        warnings.warn(
+            SlowModelWarning(
+                f"model '{model.name}', {what}: a quaternion of the state goes through {', '.join(left)},"
+                " so that its derivative is taken by its four numbers, which is slower; use the functions"
+                " of jaxekf.rotation"
+            ),
+            stacklevel=2,
+        )
+    if piece.unlisted:
+        warnings.warn(
+            SlowModelWarning(
+                f"model '{model.name}', {what}: got the operations {', '.join(piece.unlisted)}, expected"
+                " arithmetic, small products and rearrangements; each run takes them by itself, which is"
+                " slower"
+            ),
+            stacklevel=2,
+        )
 
 
 def is_diagonal(matrix: structure.Known) -> bool:
     return bool(np.all(matrix.is_zero() | np.eye(matrix.value.shape[0], dtype=bool)))
 
 
-def _unknown_block(jacobian: Array, p: Pattern) -> Array | None:
-    """Rows of the unknown block, of a Jacobian that has the block's columns only."""
-    return patterned.take(jacobian, p.rows, 0) if p.rows else None
+def noise_of(function: Callable[..., Array], *spec: Any) -> tuple[Callable[..., Array], bool]:
+    """A function that makes a covariance, as one of variances where it is diagonal; and whether it is."""
+    diagonal = is_diagonal(structure.find(programs.trace(function, *spec)))
+    return (partial(linearise.variances, function) if diagonal else function), diagonal
+
+
+def pattern_of(jacobian: Callable[..., Jacobian], *spec: Any) -> Pattern:
+    """What is known of a Jacobian."""
+    dense = programs.trace(lambda *args: jacobian(*args).dense(), *spec)
+    return patterned.pattern(structure.find(dense))
 
 
 def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
-    whole = known(partial(linearise.linearise_transition, model), params, x, u, dt)
-    state, noise = patterned.pattern(whole[1]), patterned.pattern(whole[2])
-    sigma = known(model.process_noise, params, dt)
-    diagonal = is_diagonal(sigma)
+    linearised = partial(linearise.transition_blocks, model)
+    spec = (params, x, u, dt)
+    state = pattern_of(lambda *args: linearised(*args).f, *spec)
+    noise = pattern_of(lambda *args: linearised(*args).g, *spec)
+    left: list[tuple[str, ...]] = []
 
-    def step(params: Any, x: Any, u: Any, dt: Array) -> Any:
-        predicted, f, g = linearise.linearise_transition(
-            model, params, x, u, dt, state.cols, noise.cols
-        )
-        sigma = model.process_noise(params, dt)
-        sigma = linalg.diagonal(sigma) if diagonal else sigma
-        return predicted, _unknown_block(f, state), _unknown_block(g, noise), sigma
+    def step(*args: Any) -> Any:
+        found = linearised(*args)
+        left.append(found.left)
+        return found.mean, found.f.bands(state), found.g.bands(noise)
 
-    return Transition(Piece(step, params, x, u, dt), state, noise, diagonal)
+    sigma, diagonal = noise_of(model.process_noise, params, dt)
+    piece = Piece(step, *spec)
+    warn_of(model, "transition", left[-1], piece)
+    density = Piece(lambda *args: [sigma(*args)], params, dt)
+    warn_of(model, "process_noise", (), density)
+    return Transition(piece, density, state, noise, diagonal)
 
 
 def measurement(
@@ -261,41 +246,43 @@ def measurement(
     x: Any,
     u: Any,
     rows: Any,
-    linearised: Callable[..., Any] = linearise.linearise_sensor,
+    linearised: Callable[..., linearise.LinearSample] = linearise.sample_blocks,
 ) -> Measurement:
     one = sensor if sensor.alike is None else sensor.alike
     if sensor.alike is not None:
         rows = many.one_of(rows, sensor.copies)
     function = partial(linearised, model, one)
-    whole = known(function, params, x, u, rows)
-    slope = patterned.pattern(whole[1])
-    diagonal = is_diagonal(whole[2])
-    few = {"columns": slope.cols} if linearised is linearise.linearise_sensor else {}
+    slope = pattern_of(lambda *args: function(*args).slope, params, x, u, rows)
+    noise, diagonal = noise_of(one.noise, params, rows.aux, rows.dt)
+    left: list[tuple[str, ...]] = []
 
     def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
-        residual, h, noise = function(params, x, u, rows, **few)
-        noise = linalg.diagonal(noise) if diagonal else noise
-        return residual, _unknown_block(h, slope) if few else cut(h, slope), noise
+        found = function(params, x, u, rows)
+        left.append(found.left)
+        return found.residual, found.slope.bands(slope), noise(params, rows.aux, rows.dt)
 
     piece = Piece(sample, params, x, u, rows)
+    warn_of(model, f"sensor '{sensor.name}'", left[-1], piece)
     return Measurement(sensor, piece, slope, diagonal)
 
 
 def _correction(model: Model, params: Any, x: Any) -> Correction:
     delta = jax.ShapeDtypeStruct((model.error_dim,), manifold.dtype_of(x))
     used = jax.ShapeDtypeStruct((), jnp.bool_)
-    reset = patterned.pattern(known(partial(manifold.reset_jacobian, model.space), delta))
+    known = structure.find(programs.trace(partial(manifold.reset_jacobian, model.space), delta))
+    reset = patterned.pattern(known)
 
     def move(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
         moved = manifold.retract(model.space, x, delta)
-        mean, shift, block = moved, None, None
+        mean, shift = moved, None
         if model.project is not None:
             mean = model.project(moved)
             shift = manifold.local(model.space, moved, mean)
             shift = jnp.where(any_used, shift, 0.0)
         mean = manifold.copy_where(any_used, mean, x)
-        if reset.rows:
-            block = cut(manifold.reset_jacobian(model.space, delta), reset)
-        return mean, block, shift
+        bands = patterned.cut(manifold.reset_jacobian(model.space, delta), reset)
+        return mean, bands, shift
 
-    return Correction(Piece(move, params, x, delta, used), reset)
+    piece = Piece(move, params, x, delta, used)
+    warn_of(model, "state space", (), piece)
+    return Correction(piece, reset)

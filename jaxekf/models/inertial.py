@@ -113,8 +113,8 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
     """
     force = params.calibration.accelerometer_matrix @ u.mean[3:] - x.accelerometer_bias
     turn = _rate(x, u.mean, params) * dt
-    once = jnp.cross(turn, force)
-    twice = jnp.cross(turn, once)
+    once = rotation.cross(turn, force)
+    twice = rotation.cross(turn, once)
     gained = (force + once / 2.0 + twice / 6.0) * dt + w[3:6]
     moved = (force / 2.0 + once / 6.0 + twice / 24.0) * dt * dt + 0.5 * dt * w[3:6]
     fall = params.setup.gravity_ref * dt
@@ -192,7 +192,7 @@ def _rate(x: State, measured: Array, params: Parameters) -> Array:
 
 
 def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
-    swing = jnp.cross(_rate(x, u.value, params), params.setup.p_body_object)
+    swing = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
     return x.velocity + rotation.rotate(x.q_ref_body, swing)
 
 

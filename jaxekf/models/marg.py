@@ -110,8 +110,8 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
     """
     force = u.mean[3:] - params.calibration.accelerometer_bias
     turn = body_rate(x, u.mean, params) * dt
-    once = jnp.cross(turn, force)
-    twice = jnp.cross(turn, once)
+    once = rotation.cross(turn, force)
+    twice = rotation.cross(turn, once)
     gained = (force + once / 2.0 + twice / 6.0) * dt + w[3:6]
     return State(
         SO3().retract(x.q_ref_body, turn + w[:3]),

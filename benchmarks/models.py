@@ -48,8 +48,8 @@ CONTENDERS: dict[str, Callable[[], Model]] = {
     },
     "markers": _markers,
 }
-"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; `visual` as in `vision.py`; a toy of 15
-degrees of freedom. They have no gates, as textbook JAX has none."""
+"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; `visual` as in `vision.py`; a toy
+of 15 degrees of freedom. They have no gates, as textbook JAX has none."""
 MAIN = tuple(name for name in CONTENDERS if name != "markers")
 """The package's own."""
 

@@ -3,42 +3,49 @@
 JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
 """
 
-from jaxekf import manifold, rotation, timeline, unscented, vectors, wahba
-from jaxekf.consistency import Consistency, Whiteness
-from jaxekf.datasets import demo
-from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
-from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
-from jaxekf.errors import (
-    FilterError,
-    JaxekfError,
-    MissingPackageError,
-    ModelError,
-    PrecisionError,
-    RecordingError,
-    ResourceError,
-    TuningError,
-)
-from jaxekf.estimation import estimate, estimate_many
-from jaxekf.export import read_export
-from jaxekf.gaps import split_at_gaps
-from jaxekf.interpolation import InputSample
-from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
-from jaxekf.kernels import jit
-from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
-from jaxekf.metrics import Score, score
-from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor, Start
-from jaxekf.models import get_model
-from jaxekf.online import estimate_online
-from jaxekf.parameters import load as load_parameters
-from jaxekf.parameters import save as save_parameters
-from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
-from jaxekf.requested import Every, every
-from jaxekf.result import Estimate, OutputEstimate, SensorRecord
-from jaxekf.robust import robust
-from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
-from jaxekf.storage import load, save
-from jaxekf.stream import Known, Stream
-from jaxekf.verdicts import Fault, Verdict
+from typing import TYPE_CHECKING
+
+from jaxekf.lazy import attributes
+
+if TYPE_CHECKING:
+    from jaxekf import manifold, rotation, timeline, unscented, vectors, wahba
+    from jaxekf.consistency import Consistency, Whiteness
+    from jaxekf.datasets import demo
+    from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
+    from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
+    from jaxekf.errors import (
+        CacheError,
+        FilterError,
+        JaxekfError,
+        MissingPackageError,
+        ModelError,
+        PrecisionError,
+        RecordingError,
+        ResourceError,
+        TuningError,
+    )
+    from jaxekf.estimation import estimate, estimate_many
+    from jaxekf.export import read_export
+    from jaxekf.gaps import split_at_gaps
+    from jaxekf.interpolation import InputSample
+    from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
+    from jaxekf.kernels import jit
+    from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
+    from jaxekf.metrics import Score, score
+    from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor, Start
+    from jaxekf.models import get_model
+    from jaxekf.online import estimate_online
+    from jaxekf.parameters import load as load_parameters
+    from jaxekf.parameters import save as save_parameters
+    from jaxekf.program_cache import keep_programs
+    from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
+    from jaxekf.requested import Every, every
+    from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+    from jaxekf.robust_weights import robust
+    from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
+    from jaxekf.storage import load, save
+    from jaxekf.stream import Known, Stream
+    from jaxekf.verdicts import Fault, Verdict
 
 __version__ = "0.1.0"
 
@@ -46,6 +53,7 @@ __all__ = [
     "SO3",
     "AdditiveQuaternion",
     "Belief",
+    "CacheError",
     "Camera",
     "Consistency",
     "Diagnosis",
@@ -96,6 +104,7 @@ __all__ = [
     "get_model",
     "initial_belief",
     "jit",
+    "keep_programs",
     "load",
     "load_parameters",
     "manifold",
@@ -117,3 +126,47 @@ __all__ = [
     "vectors",
     "wahba",
 ]
+
+_PLACES = {
+    "jaxekf.consistency": ("Consistency", "Whiteness"),
+    "jaxekf.datasets.demo": ("demo",),
+    "jaxekf.diagnostics": ("Diagnosis", "SensorDiagnosis", "diagnose", "diagnose_many"),
+    "jaxekf.ekf": ("FilterOutput", "initial_belief", "run_filter", "run_filter_batch"),
+    "jaxekf.errors": (
+        "CacheError",
+        "FilterError",
+        "JaxekfError",
+        "MissingPackageError",
+        "ModelError",
+        "PrecisionError",
+        "RecordingError",
+        "ResourceError",
+        "TuningError",
+    ),
+    "jaxekf.estimation": ("estimate", "estimate_many"),
+    "jaxekf.export": ("read_export",),
+    "jaxekf.gaps": ("split_at_gaps",),
+    "jaxekf.interpolation": ("InputSample",),
+    "jaxekf.iterated": ("IteratedOutput", "run_iterated_smoother", "run_iterated_smoother_batch"),
+    "jaxekf.kernels": ("jit",),
+    "jaxekf.manifold": ("SO3", "AdditiveQuaternion", "Euclidean", "Manifold"),
+    "jaxekf.metrics": ("Score", "score"),
+    "jaxekf.model": ("Belief", "Input", "Model", "Output", "Parameters", "Sensor", "Start"),
+    "jaxekf.models": ("get_model",),
+    "jaxekf.online": ("estimate_online",),
+    "jaxekf.parameters": ("load_parameters", "save_parameters"),
+    "jaxekf.program_cache": ("keep_programs",),
+    "jaxekf.recording": ("Camera", "Encoder", "Imu", "Markers", "Optical", "Recording", "Samples"),
+    "jaxekf.requested": ("Every", "every"),
+    "jaxekf.result": ("Estimate", "OutputEstimate", "SensorRecord"),
+    "jaxekf.robust_weights": ("robust",),
+    "jaxekf.smoother": ("SmootherOutput", "run_smoother", "run_smoother_batch"),
+    "jaxekf.storage": ("load", "save"),
+    "jaxekf.stream": ("Known", "Stream"),
+    "jaxekf.verdicts": ("Fault", "Verdict"),
+}
+_RENAMED = {"load_parameters": "load", "save_parameters": "save"}
+
+if not TYPE_CHECKING:
+    # Hidden from type checkers, which would take any name for one that is there.
+    __getattr__, __dir__ = attributes(__name__, _PLACES, _RENAMED)

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.attitude_match import AttitudeMatch, refine
 from jaxekf.errors import ModelError, RecordingError
 from jaxekf.model import Model, Parameters
@@ -182,7 +182,7 @@ def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
     freedom = (len(values) - 1) * values.shape[1]
     if freedom == 0:
         return mean, cov, 0.0, float("nan")
-    p = float(chi2.sf(statistic, freedom))
+    p = float(chi_square.sf(statistic, freedom))
     return mean, cov * max(1.0, statistic / freedom if p < _AGREE else 1.0), statistic, p
 
 

@@ -8,8 +8,8 @@ freedom of the kind of noise that prevails at ``tau`` (Riley, NIST SP 1065, tabl
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.densities import Densities, fit
 from jaxekf.errors import RecordingError
 from jaxekf.recording import NANOSECONDS, Floats, Imu, Times, period_ns
@@ -106,8 +106,8 @@ def sensor_noise(values: Floats, period_s: float, unit: str) -> SensorNoise:
         ],
         axis=1,
     )
-    low = found * np.sqrt(freedom / chi2.ppf(0.975, freedom))
-    high = found * np.sqrt(freedom / chi2.ppf(0.025, freedom))
+    low = found * np.sqrt(freedom / chi_square.ppf(0.975, freedom))
+    high = found * np.sqrt(freedom / chi_square.ppf(0.025, freedom))
     return SensorNoise(unit, Curve(tau, found, low, high), (x, y, z))
 
 

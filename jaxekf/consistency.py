@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import chi2, kstest, norm
+from scipy.special import ndtri
 
+from jaxekf import chi_square
 from jaxekf.recording import NANOSECONDS, Flags, Floats, Times, period_ns
 
 BAND = 0.95
@@ -145,7 +146,7 @@ def inflation(series: Sequence[Floats], lags: int | None = None) -> float:
     longest = max(len(values) for values in series)
     rho, pairs = autocorrelation(series, min(longest // 3, 5000) if lags is None else lags)
     mean, number = rho.mean(axis=0)[1:], pairs.sum(axis=0)[1:]
-    lost = mean * np.sqrt(np.maximum(number, 1.0)) < norm.ppf(0.5 + 0.5 * BAND)
+    lost = mean * np.sqrt(np.maximum(number, 1.0)) < ndtri(0.5 + 0.5 * BAND)
     end = int(np.argmax(lost)) if lost.any() else len(mean)
     return float(max(1.0, 1.0 + 2.0 * mean[:end].sum()))
 
@@ -155,6 +156,9 @@ def judge_squares(squares: Sequence[Floats], freedom: Sequence[Any]) -> Consiste
 
     Samples of no degree of freedom do not count.
     """
+    # Half of what this package's imports would take: only for those who ask whether a run is consistent.
+    from scipy.stats import kstest
+
     kept = [f > 0 for f in freedom]
     runs = [s[k] for s, k in zip(squares, kept, strict=True)]
     freedoms = [np.asarray(f[k], float) for f, k in zip(freedom, kept, strict=True)]
@@ -168,13 +172,15 @@ def judge_squares(squares: Sequence[Floats], freedom: Sequence[Any]) -> Consiste
     effective = square.size / grown
     tails = np.array([0.5 * (1 + SURE), 0.5 * (1 - SURE)])
     total = degrees.sum() / grown
-    low, high = mean * total / chi2.ppf(tails, total)
+    low, high = mean * total / chi_square.ppf(tails, total)
     edges = np.array([0.5 * (1 - BAND), 0.5 * (1 + BAND)])
-    place = chi2.cdf(square, degrees)
+    place = chi_square.cdf(square, degrees)
     common = np.bincount(degrees.astype(int)).argmax()
     stride = int(np.ceil(grown))
-    apart = np.concatenate([chi2.cdf(s, f)[::stride] for s, f in zip(runs, freedoms, strict=True)])
-    band: Any = chi2.ppf(edges, common)
+    apart = np.concatenate(
+        [chi_square.cdf(s, f)[::stride] for s, f in zip(runs, freedoms, strict=True)]
+    )
+    band: Any = chi_square.ppf(edges, common)
     return Consistency(
         samples=int(square.size),
         freedom=float(degrees.mean()),
@@ -183,7 +189,7 @@ def judge_squares(squares: Sequence[Floats], freedom: Sequence[Any]) -> Consiste
         interval=(float(low), float(high)),
         band=(float(band[0]), float(band[1])),
         inside=float(np.mean((place >= edges[0]) & (place <= edges[1]))),
-        typical=float(np.median(square / chi2.ppf(0.5, degrees))),
+        typical=float(np.median(square / chi_square.ppf(0.5, degrees))),
         ks=float(kstest(place, "uniform").statistic),
         ks_p=float(kstest(apart, "uniform").pvalue),
     )
@@ -213,11 +219,11 @@ def judge_whiteness(times: Sequence[Times], whitened: Sequence[Floats]) -> White
     return Whiteness(
         lag_s=np.asarray(period * np.arange(1, lags + 1), float),
         autocorrelation=rho,
-        bound=norm.ppf(0.5 * (1 + BAND)) / np.sqrt(pairs.mean(axis=0)),
+        bound=ndtri(0.5 * (1 + BAND)) / np.sqrt(pairs.mean(axis=0)),
         correlated_s=float(correlated),
         total=float(mean.sum()),
         total_sigma=float(spread[-1]),
-        p=float(chi2.sf(np.sum(rho**2 * pairs), rho.size)),
+        p=float(chi_square.sf(np.sum(rho**2 * pairs), rho.size)),
         mean=middle,
         mean_sigma=deviation * np.sqrt(np.array(grown) / count),
         scale=np.sqrt(np.nansum(values**2, axis=0) / count),

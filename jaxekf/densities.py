@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.fft import dst
 from scipy.optimize import brentq, nnls
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.recording import Flags, Floats
 
 TERMS = ("quantisation", "white", "flicker", "walk")
 _ALL = _QUANTISATION, _WHITE, _FLICKER, _WALK = (0, 1, 2, 3)
-_INTERVAL = float(chi2.ppf(0.95, 1))
-_SIGNIFICANT = float(chi2.ppf(0.99, 1))
+_INTERVAL = float(chi_square.ppf(0.95, 1))
+_SIGNIFICANT = float(chi_square.ppf(0.99, 1))
 """By how much twice the logarithm of the likelihood must grow for a third term to be believed."""
 _LINES_PER_E = 25.0
 _ROUNDS = 60

@@ -9,9 +9,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
-from jaxekf import manifold
+from jaxekf import chi_square, manifold
 from jaxekf.consistency import (
     Consistency,
     Whiteness,
@@ -195,7 +194,7 @@ def _pooled(found: Sequence[Faults]) -> tuple[Fault, ...]:
             square, freedom = sum(each.wald(part) for each in found), freedom * len(found)
         effect = np.sqrt(sum(each.rows * each.effect(part) ** 2 for each in found) / total)
         sigma = np.sqrt(np.diagonal(cov))
-        p = float(chi2.sf(square, freedom))
+        p = float(chi_square.sf(square, freedom))
         faults.append(
             Fault(kind, tuple(size.tolist()), tuple(sigma.tolist()), unit, p, float(effect))
         )

@@ -47,6 +47,10 @@ class ResourceError(JaxekfError):
     """There is too little memory for what was asked; the message names the run."""
 
 
+class CacheError(JaxekfError):
+    """Compiled programs cannot be kept in the folder that the message names."""
+
+
 class MissingPackageError(JaxekfError):
     """What was asked needs a package that is not installed; the message says how to install it."""
 

@@ -131,11 +131,14 @@ def _step(
         found = operation.bind(values)
         return found, _differentiated(operation, values, numbers, found)
     rule = _RULES[name.removeprefix("jaxekf.rotation.")]
-    if all(t.turn or not t.by for t, q in zip(tangents, rule.turns, strict=True) if q):
+    single = all(np.ndim(v) == 1 for v in values)
+    if single and all(t.turn or not t.by for t, q in zip(tangents, rule.turns, strict=True) if q):
         (found,) = operation.bind(values)
         return [found], [rule.function(found, values, [t.by for t in tangents])]
-    # With a quaternion that is four free numbers beside it, a rotation is followed by its numbers, too.
-    numbers = [Tangent(False, _as_numbers(v, t, [], name)) for v, t in zip(values, tangents, strict=True)]
+    # Beside a quaternion that is four free numbers, and for many at once, rotations are followed by theirs.
+    numbers = [
+        Tangent(False, _as_numbers(v, t, [], name)) for v, t in zip(values, tangents, strict=True)
+    ]
     inner = programs.opened(operation, frozenset(rotation.GROUP_CALLS))
     return _followed(inner, values, numbers, left)
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from jaxekf.recording import NANOSECONDS, Flags, Floats, Imu, period_ns
 
@@ -49,6 +48,9 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     The low-pass is of second order (Butterworth) and takes `settling_s` seconds. What the gyroscope reads
     at rest is taken off, where the run rests: what is led on by a bias lags behind by degrees.
     """
+    # Slow to import, and every model is imported with this module.
+    from scipy.signal import butter, sosfilt, sosfilt_zi
+
     assert imu.accelerometer is not None
     resting = still(imu)
     bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)

@@ -161,9 +161,7 @@ def _used(first: SmootherOutput, steps: Steps) -> Given:
 
 @lru_cache(maxsize=64)
 def _lanes(system: AboutSystem, devices: tuple[Any, ...]) -> Any:
-    return own_derivative.with_own_derivative(
-        devices, partial(_iteration, system, True)
-    )
+    return own_derivative.with_own_derivative(devices, partial(_iteration, system, True))
 
 
 # --- one block of runs, on lanes ----------------------------------------------------------------------

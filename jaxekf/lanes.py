@@ -28,7 +28,17 @@ _COSTLY = {"div": 6.0, "rsqrt": 6.0, "sqrt": 6.0} | dict.fromkeys(
 """Cost of one number, in additions."""
 ELEMENTWISE = frozenset(
     [
-        *("abs", "add", "add_any", "and", "ceil", "clamp", "convert_element_type", "copy", "copy_p"),
+        *(
+            "abs",
+            "add",
+            "add_any",
+            "and",
+            "ceil",
+            "clamp",
+            "convert_element_type",
+            "copy",
+            "copy_p",
+        ),
         *("eq", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lt", "max", "min", "mul"),
         *("ne", "neg", "nextafter", "not", "or", "round", "select_n", "sign", "square"),
         *("stop_gradient", "sub", "xor", *_COSTLY),

@@ -68,7 +68,9 @@ def _joined(pieces: list[Any], axis: int) -> Any:
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces, axis)
 
 
-def _cut(sizes: tuple[int, ...], index: range | tuple[int, ...]) -> list[tuple[int, tuple[int, ...]]]:
+def _cut(
+    sizes: tuple[int, ...], index: range | tuple[int, ...]
+) -> list[tuple[int, tuple[int, ...]]]:
     """The blocks that contain the given rows or columns, and which of theirs these are."""
     found, start = [], 0
     for i, size in enumerate(sizes):
@@ -221,10 +223,11 @@ def residual_blocks(
     """As `sample_blocks`, but with the Jacobian of the residual itself, its sign turned: where a
     sample is curved the two differ by how far it is away."""
 
+    here = sensor.predict(x, u, params, rows.aux)
+    value = _neutral(sensor.space, rows.value, rows.mask, here)
+
     def residual(x: Any) -> Array:
-        expected = sensor.predict(x, u, params, rows.aux)
-        value = _neutral(sensor.space, rows.value, rows.mask, expected)
-        found = manifold.local(sensor.space, expected, value)
+        found = manifold.local(sensor.space, sensor.predict(x, u, params, rows.aux), value)
         return jnp.where(rows.mask, found, 0.0)
 
     state = _spaces(model.space)
@@ -254,7 +257,9 @@ def variances(function: Callable[..., Array], *args: Any) -> Array:
         maker = None if isinstance(operand, Constant) else makers.get(operand)
         size = np.shape(value(operand))[0]
         if maker is not None and maker.primitive.name in lanes.ELEMENTWISE:
-            return maker.bind([diagonal(i) if np.ndim(value(i)) else value(i) for i in maker.inputs])[0]
+            return maker.bind(
+                [diagonal(i) if np.ndim(value(i)) else value(i) for i in maker.inputs]
+            )[0]
         if maker is not None and maker.primitive.name == "broadcast_in_dim":
             (source,) = maker.inputs
             if np.ndim(value(source)) == 0:

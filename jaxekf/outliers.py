@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from scipy.stats import chi2
 
-from jaxekf import algebra, linalg, many
+from jaxekf import algebra, chi_square, linalg, many
 from jaxekf.lanes import written_sum
 from jaxekf.model import Sensor
 from jaxekf.patterned import Pattern
@@ -134,7 +133,7 @@ def _alone(sensor: Sensor) -> Sensor:
 def _bound(share: Any, members: tuple[int, ...], visible: Array, like: Array) -> Array:
     """Which a `share` of honest squared distances of as many visible rows does not exceed; where none is
     visible, that of one."""
-    bounds = chi2.ppf(share, np.arange(1, len(members) + 1))
+    bounds = chi_square.ppf(share, np.arange(1, len(members) + 1))
     found = jnp.full_like(like, bounds[0])
     for count in range(2, len(bounds) + 1):
         found = jnp.where(visible == count, bounds[count - 1], found)

@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.stats import chi2
 
-from jaxekf import linalg, manifold, projection
+from jaxekf import chi_square, linalg, manifold, projection
 from jaxekf.model import Belief, Parameters
 from jaxekf.models import visual
 from jaxekf.recording import Flags, Floats
@@ -54,7 +53,7 @@ def ellipses(regions: Regions, share: float = 0.99) -> tuple[Floats, Floats]:
     """Half axes (..., L, 2), pixels, the longer first, of ellipses that hold a `share` of points,
     and the angle (..., L), radians, of the longer from u towards v."""
     values, vectors = np.linalg.eigh(np.asarray(regions.cov))
-    half = np.sqrt(chi2.ppf(share, 2) * np.maximum(values[..., ::-1], 0.0))
+    half = np.sqrt(chi_square.ppf(share, 2) * np.maximum(values[..., ::-1], 0.0))
     return half, np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1])
 
 
@@ -62,4 +61,4 @@ def inside(regions: Regions, pixel: Floats, share: float = 0.99) -> Flags:
     """(..., L) which image points (..., L, 2) lie in the region that holds a `share` of honest ones."""
     off = np.asarray(pixel) - np.asarray(regions.pixel)
     white = np.linalg.solve(np.asarray(regions.cov), off[..., None])[..., 0]
-    return np.sum(off * white, axis=-1) <= chi2.ppf(share, 2)
+    return np.sum(off * white, axis=-1) <= chi_square.ppf(share, 2)

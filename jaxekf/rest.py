@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.errors import RecordingError
 from jaxekf.recording import (
     NANOSECONDS,
@@ -193,8 +193,8 @@ def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter
     whole = np.median(np.abs(np.concatenate(about)), axis=0) / _MEDIAN
     return Scatter(
         found,
-        found * np.sqrt(freedom / chi2.ppf(0.975, freedom)),
-        found * np.sqrt(freedom / chi2.ppf(0.025, freedom)),
+        found * np.sqrt(freedom / chi_square.ppf(0.975, freedom)),
+        found * np.sqrt(freedom / chi_square.ppf(0.025, freedom)),
         len(step),
         float(np.max(whole / np.maximum(found, 1e-15))),
     )

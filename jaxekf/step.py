@@ -16,6 +16,7 @@ from jaxekf.patterned import Bands, Pattern
 from jaxekf.system import Measurement, System
 from jaxekf.timeline import Rows
 
+
 class Moment(NamedTuple):
     """What a substep is given besides samples."""
 

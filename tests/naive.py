@@ -22,10 +22,10 @@ def _predict(model, params, x, p, u, dt):
         return model.transition(manifold.retract(model.space, x, d), u, dt, w, params)
 
     sigma = model.process_noise(params, dt)
-    still, here = jnp.zeros(sigma.shape[0]), jnp.zeros(model.error_dim)
-    ahead = model.transition(x, u, dt, still, params)
-    f = _slope(model.space, lambda d: move(d, still), x, ahead, model.error_dim)
-    g = _slope(model.space, lambda w: move(here, w), x, ahead, sigma.shape[0])
+    n, m = model.error_dim, sigma.shape[0]
+    ahead = model.transition(x, u, dt, jnp.zeros(m), params)
+    both = _slope(model.space, lambda dw: move(dw[:n], dw[n:]), x, ahead, n + m)
+    f, g = both[:, :n], both[:, n:]
     return ahead, f @ p @ f.T + g @ sigma @ g.T
 
 
@@ -86,9 +86,10 @@ def _update(model, params, x, p, u, samples):
     r = jax.scipy.linalg.block_diag(*[look[2] for look in looks])
     e, h = jnp.where(mask, e, 0.0), jnp.where(mask[:, None], h, 0.0)
     r = jnp.where(mask[:, None] & mask[None], r, jnp.eye(len(e)))
-    s = h @ p @ h.T + r
-    gain = jnp.linalg.solve(s, h @ p).T
-    fit = e @ jnp.linalg.solve(s, e) + jnp.linalg.slogdet(s)[1]
+    root = jnp.linalg.cholesky(h @ p @ h.T + r)
+    white = jax.scipy.linalg.solve_triangular(root, jnp.c_[e, h @ p], lower=True)
+    gain = jax.scipy.linalg.solve_triangular(root, white[:, 1:], lower=True, trans=1).T
+    fit = white[:, 0] @ white[:, 0] + 2.0 * jnp.sum(jnp.log(jnp.diagonal(root)))
     gained = -0.5 * (fit + jnp.sum(mask) * jnp.log(2.0 * jnp.pi))
     delta = gain @ e
     rest = jnp.eye(model.error_dim) - gain @ h

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scenario
 
 from jaxekf import get_model, jit, simulate, simulate_camera, simulate_tool
 from jaxekf.models import REGISTRY
@@ -106,17 +105,15 @@ def gradient(model, where, free, base, data, weights):
     return pull(weights)[0]
 
 
-def by_differences(model, where, free, base, data, weights, h=2e-3):
-    """Fourth-order central differences of the weighted terms."""
+def by_differences(model, where, free, base, data, h=2e-3):
+    """Fourth-order central differences of all terms, (terms, n)."""
     found = []
     for i in range(len(free)):
-        step = jnp.zeros_like(free).at[i].set(h)
-        f = [
-            float(values(model, where, free + k * step, base, data) @ weights)
-            for k in (-2, -1, 1, 2)
-        ]
+        step = np.zeros(len(free))
+        step[i] = h
+        f = [np.asarray(values(model, where, free + k * step, base, data)) for k in (-2, -1, 1, 2)]
         found.append((f[0] - 8 * f[1] + 8 * f[2] - f[3]) / (12 * h))
-    return np.array(found)
+    return np.array(found).T
 
 
 def start_of(model):
@@ -144,9 +141,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize(
-    "name", scenario.long_form(NAMES, {"loose_rate", "loose_additive", "tight", "marg", "visual"})
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_gradient_matches_central_differences(name, case):
     model = get_model(name)
     data = CASES[case](model)
@@ -154,12 +149,14 @@ def test_gradient_matches_central_differences(name, case):
     where = noise.layout(
         model, base, [s for s in ("noise", "calibration", "initial") if getattr(base, s)]
     )
-    free = where.to_free(base)
+    free = np.asarray(where.to_free(base))
+    each = by_differences(model, where, free, base, data)
+    now = np.asarray(values(model, where, free, base, data))
     for weights in (*np.eye(3), np.array([1.0, 0.1, 0.5])):
         got = np.asarray(gradient(model, where, free, base, data, jnp.asarray(weights)))
-        expected = by_differences(model, where, free, base, data, weights)
+        expected = weights @ each
         size = np.linalg.norm(expected)
-        value = abs(float(values(model, where, free, base, data) @ weights))
+        value = abs(float(now @ weights))
         assert np.all(np.isfinite(got))
         # The floor is the rounding of the differences themselves, for gradients that are exactly 0.
         assert np.linalg.norm(got - expected) <= 1e-6 * size + 1e-10 * (1.0 + value), (
@@ -176,11 +173,11 @@ def test_gradient_reaches_every_entry_of_a_full_covariance(axes):
     data = CASES["moving"](model)
     base = noise.with_axes(model, model.parameters, axes)
     where = noise.layout(model, base)
-    free = where.to_free(base) + 0.05 * np.random.default_rng(0).standard_normal(
+    free = np.asarray(where.to_free(base)) + 0.05 * np.random.default_rng(0).standard_normal(
         len(where.labels())
     )
     weights = np.array([1.0, 0.1, 0.5])
     got = np.asarray(gradient(model, where, free, base, data, jnp.asarray(weights)))
-    expected = by_differences(model, where, free, base, data, weights)
+    expected = weights @ by_differences(model, where, free, base, data)
     assert np.linalg.norm(got - expected) <= 1e-6 * np.linalg.norm(expected)
     assert np.all(np.abs(got) > 0.0)

@@ -15,12 +15,12 @@ from jaxekf import (
     estimate_many,
     estimation,
     jit,
+    lanes,
     padding,
     patterned,
     programs,
     recursion,
     run_filter,
-    scalars,
     simulate,
     structure,
     timeline,
@@ -46,7 +46,7 @@ def test_structure_is_found_where_it_is():
     np.testing.assert_array_equal(found.known, expected)
     np.testing.assert_array_equal(found.value[1:], [[0, 0, 1], [0, 1, 0]])
     form = patterned.pattern(found)
-    assert (form.rows, form.cols) == ((0,), (0, 2))
+    assert form.bands == (((0,), (0, 2)),)
 
 
 def test_what_is_not_understood_is_not_called_known():
@@ -57,10 +57,16 @@ def test_what_is_not_understood_is_not_called_known():
     assert not mixed.known.any()
 
 
-@pytest.mark.parametrize("name", ["sort", "cumsum", "while", "cond", "solve"])
-def test_numbers_one_by_one_are_those_of_the_function(name):
-    """An operation that is taken apart wrongly, or one left whole put back in the wrong order."""
+@pytest.mark.parametrize("name", ["plain", "sort", "cumsum", "while", "cond", "solve"])
+def test_values_on_lanes_are_those_of_the_function(name):
+    """A rule that moves an axis to the wrong place, or an operation without one put back in the wrong order."""
     functions = {
+        "plain": lambda x, m: (
+            jnp.where(
+                x > 0, jnp.einsum("ij,kj->ki", m, m[::-1]) @ x, jnp.cross(x, jnp.pad(x[1:], (1, 0)))
+            )
+            + jnp.max(m, axis=1) * jnp.sum(m[:, :2].T, axis=0) / jnp.arctan2(x, 2.0)
+        ),
         "sort": lambda x, m: jnp.sort(x)[::-1] + m[0, 0] * 2.0,
         "cumsum": lambda x, m: jnp.cumsum(x) @ m,
         "while": lambda x, m: jax.lax.fori_loop(0, 3, lambda i, y: y @ m + 1.0, x),
@@ -70,8 +76,8 @@ def test_numbers_one_by_one_are_those_of_the_function(name):
     rng = np.random.default_rng(0)
     x, m = rng.normal(size=(5, 3)), np.eye(3) + 0.1 * rng.normal(size=(5, 3, 3))
     program = programs.trace(functions[name], x[0], m[0])
-    lanes = [jnp.moveaxis(jnp.asarray(a), 0, -1) for a in (x, m)]
-    found = jnp.moveaxis(scalars.evaluate(program, lanes), -1, 0)
+    values = [jnp.moveaxis(jnp.asarray(a), 0, -1) for a in (x, m)]
+    found = jnp.moveaxis(lanes.evaluate(structure.simplified(program), values), -1, 0)
     np.testing.assert_allclose(found, jax.vmap(functions[name])(x, m), rtol=1e-13, atol=1e-14)
 
 

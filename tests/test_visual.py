@@ -78,25 +78,30 @@ def test_the_eight_is_followed(name):
 def test_both_forms_agree():
     """Would catch a bilinear form whose noise is not its image point's: eqs. 3a and 11c say the same."""
     recording = camera_recording("run", seed=3, duration_s=1.0, grade=few(pixel=0.3))
-    x, params, samples = None, {}, {}
+    x, samples = None, []
     for model in (visual.for_points(POINTS), visual.for_points(POINTS, True)):
         line = timeline.build(model, recording)
         params = as_arrays(model.parameters)._replace(setup=line.setup)
         x = as_arrays(model.initial_mean(line.first)) if x is None else x
-        sensor = model.sensor("camera").alike
         rows = line.steps.slow["camera"]
         aux = jax.tree.map(lambda a: jnp.asarray(a[0, 0]), rows.aux)
-        value = jnp.asarray(rows.value[0, :2])
 
-        def residual(delta, sensor=sensor, params=params, aux=aux, value=value, model=model):
-            there = manifold.retract(model.space, x, delta)
-            return value - sensor.predict(there, None, params, aux)
+        @jax.jit
+        def whitened(x, params, aux, value, model=model):
+            sensor = model.sensor("camera").alike
 
-        zero = jnp.zeros(21)
-        factor = jnp.linalg.cholesky(sensor.noise(params, aux, jnp.asarray(0.08)))
-        slope = jnp.linalg.solve(factor, jax.jacfwd(residual)(zero))
-        samples[model.name] = (jnp.linalg.solve(factor, residual(zero)), slope)
-    (one, first), (other, second) = samples.values()
+            def residual(delta):
+                there = manifold.retract(model.space, x, delta)
+                return value - sensor.predict(there, None, params, aux)
+
+            zero = jnp.zeros(21)
+            factor = jnp.linalg.cholesky(sensor.noise(params, aux, jnp.asarray(0.08)))
+            found = residual(zero), jax.jacfwd(residual)(zero)
+            return tuple(jnp.linalg.solve(factor, part) for part in found)
+
+        told = whitened(x, params, aux, jnp.asarray(rows.value[0, :2]))
+        samples.append(tuple(map(np.asarray, told)))
+    (one, first), (other, second) = samples
     assert np.linalg.norm(one) > 0.1
     assert np.linalg.norm(other) == pytest.approx(np.linalg.norm(one), rel=0.03)
     # What they say of the state: score and information, whatever the axes of the two rows.
@@ -278,11 +283,26 @@ def test_a_start_is_sought_where_a_pose_follows():
     np.testing.assert_allclose(start.first["velocity"], slope, atol=1e-6)
 
 
+def with_unseen(camera, count):
+    """The camera with further landmarks, behind the others, that no image shows."""
+    more = [f"unseen-{i}" for i in range(count)]
+    images = len(camera.time_ns)
+    return replace(
+        camera,
+        names=(*camera.names, *more),
+        pixel=np.concatenate([camera.pixel, np.full((images, count, 2), np.nan)], axis=1),
+        visible=np.concatenate([camera.visible, np.zeros((images, count), bool)], axis=1),
+        p_ref_landmark=np.concatenate([camera.p_ref_landmark, camera.p_ref_landmark[:count] + 1.0]),
+    )
+
+
 def test_a_start_is_where_the_pose_is_known():
     """Would catch a run that starts from four points which a pose far off fits as well, metres away, while
     the gates refuse every good point thereafter."""
     grade = CameraGrade(points=4)
     run = camera_recording("run", seed=1, duration_s=SECONDS, grade=grade)
+    # As many landmarks as elsewhere, of which the others are never seen: the same program.
+    run = run.replace(camera=with_unseen(run.camera, POINTS - 4))
     first = int(np.argmax(resection.poses(run.camera).valid))
     made = jaxekf.estimate(run, "visual")
     assert made.time_ns[0] > run.camera.time_ns[first]
@@ -313,11 +333,10 @@ def test_what_lies_behind_the_camera_tells_nothing():
     """Would catch slopes of points that no image shows, which let such a point through every gate and make
     the covariance infinite."""
     params = as_arrays(visual.DEFAULTS)
+    project = partial(projection.project, visual.lens_of(params))
+    both = jax.jit(lambda place: (project(place), jax.jacrev(project)(place)))
     for place in ([0.1, 0.2, -0.5], [0.1, 0.2, 0.0], [0.1, 0.2, 1e-4]):
-        point, slope = (
-            f(partial(projection.project, visual.lens_of(params)))(jnp.asarray(place))
-            for f in (lambda g: g, jax.jacrev)
-        )
+        point, slope = both(jnp.asarray(place))
         assert not np.any(slope)
         assert np.all(np.abs(point) > 1e3)
 

@@ -1,7 +1,7 @@
 """Models of other systems, each written as a user would: the core fits them unchanged.
 
 `MARKERS` fuses single optical markers with an IMU as input, `VISUAL` point correspondences with an IMU
-as measurement. `linear_model` is a plain Kalman filter.
+as measurement, `POINTS` has nothing but correspondences. `linear_model` is a plain Kalman filter.
 """
 
 from typing import Any, NamedTuple
@@ -240,6 +240,46 @@ VISUAL = Model(
 )
 
 
+# Point correspondences alone: a pose that drifts. All that is particular to them, in 6 numbers.
+
+
+class Pose(NamedTuple):
+    position: Any
+    q_ref_body: Any
+
+
+class PoseNoise(NamedTuple):
+    drift: Any
+    turn: Any
+    camera_scale: Any
+
+
+class PoseCalibration(NamedTuple):
+    focal_length: Any
+    p_body_camera: Any
+
+
+POINTS = Model(
+    name="points",
+    summary="point correspondences of a drifting pose",
+    space=Pose(Euclidean(3), SO3()),
+    transition=lambda x, u, dt, w, params: Pose(
+        x.position + w[:3], SO3().retract(x.q_ref_body, w[3:])
+    ),
+    process_noise=lambda params, dt: _diagonal(*params.noise[:2]) * dt,
+    sensors=(repeated(POINT, 4),),
+    parameters=Parameters(
+        PoseNoise(0.3, 0.2, 1.0),
+        PoseCalibration(1.5, np.array([0.02, 0.0, 0.05])),
+        Pose(0.05, 0.05),
+    ),
+    units=Parameters(Empty(), Empty(), Empty()),
+    noise_dims=PoseNoise(3, 3, 1),
+    initial_mean=lambda first: Pose(jnp.zeros(3), rotation.exp(jnp.array([0.1, -0.2, 0.15]))),
+    initial_covariance=lambda params: _diagonal(*params.initial),
+)
+
+
 def linear_model(transition, input_noise, slopes, noises, gate=None):
     """A time-invariant linear system ``x+ = A x + w``, ``z = H x + v``; one sensor for each H."""
 
@@ -268,7 +308,7 @@ def linear_model(transition, input_noise, slopes, noises, gate=None):
     )
 
 
-# Data for the three models above.
+# Data for the models above.
 
 EPOCHS, SUBSTEPS = 6, 2
 

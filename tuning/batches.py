@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
@@ -60,6 +59,10 @@ class Batch(NamedTuple):
     """(size,) False where a run only fills the batch."""
 
 
+_ADAM = optax.scale_by_adam()
+_adam_begin, _adam_step = jax.jit(_ADAM.init), jax.jit(_ADAM.update)
+
+
 @dataclass
 class Batches(Descent):
     """The optimiser's loop in which an iteration is a pass over all runs, a few at a time.
@@ -75,7 +78,6 @@ class Batches(Descent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.adam = optax.scale_by_adam()
         self._begin(self.start, RATE)
         self.halved = self.done = 0
 
@@ -86,8 +88,8 @@ class Batches(Descent):
 
     def _begin(self, free: Floats, rate: float) -> None:
         """A pass from here, without memory of former ones."""
-        self.free, self.rate, self.skipped = jnp.asarray(free), rate, 0
-        self.memory = self.adam.init(self.free)
+        self.free, self.rate, self.skipped = np.asarray(free), rate, 0
+        self.memory = _adam_begin(self.free)
 
     def again(self, fixed: Any) -> None:
         """Go on from the best with more numbers held at their start."""
@@ -135,8 +137,8 @@ class Batches(Descent):
             if not np.isfinite(slope).all():
                 self.skipped, self.done = 1, 0
                 return
-            change, self.memory = self.adam.update(jnp.asarray(slope), self.memory)
-            self.free = self.free - self.rate * jnp.asarray(change)
+            change, self.memory = _adam_step(slope, self.memory)
+            self.free = self.free - self.rate * np.asarray(change)
             self.done += 1
             if self.keep is not None and time.monotonic() - kept > KEEP_S:
                 self.keep(self.state_dict())
@@ -167,7 +169,7 @@ class Batches(Descent):
         for name in ("skipped", "halved", "done"):
             setattr(self, name, int(kept[f"batches_{name}"]))
         leaves, structure = jax.tree.flatten(self.memory)
-        again = [jnp.asarray(kept[f"adam_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
+        again = [np.asarray(kept[f"adam_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
         self.memory = jax.tree.unflatten(structure, again)
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxekf import padding, timeline
@@ -82,11 +81,12 @@ def _read(model: Model, runs: Sequence[Run]) -> tuple[list[Recording], list[Time
 def _check(
     found: Sequence[Data], recordings: Sequence[Recording], burn_in_s: float, need_truth: bool
 ) -> None:
-    if not any(bool(data.counted.any()) for data in found):
+    plain = [on_host(data) for data in found]
+    if not any(bool(data.counted.any()) for data in plain):
         raise TuningError(
             f"got no instant after a burn-in of {burn_in_s} s, expected some; ask for a shorter one"
         )
-    if need_truth and not any(bool(t.judged.any()) for data in found for t in data.truth.values()):
+    if need_truth and not any(bool(t.judged.any()) for data in plain for t in data.truth.values()):
         raise TuningError(
             f"got no scored encoder sample in {[r.name for r in recordings]}, expected some to"
             " compare with; add encoder.csv or tune by likelihood"
@@ -123,9 +123,15 @@ def _stack(
                 truth[name].judged[at] = known.judged & settled
                 truth[name].first[at] = known.first
                 truth[name].second[at] = known.second
-    means, setup = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    means, setup = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
     found = Data(means, setup, steps, truth, counted, np.array(place))
-    return jax.tree.map(jnp.asarray, found)
+    # `jnp.asarray` would compile a program for each shape there is.
+    return jax.tree.map(lambda a: jax.device_put(np.asarray(a)), found)
+
+
+def on_host(data: Data) -> Data:
+    """The same as NumPy arrays, to count in without compiling anything."""
+    return jax.tree.map(np.asarray, data)
 
 
 def _blank(name: str, shape: tuple[int, ...]) -> Any:

@@ -1,12 +1,12 @@
 """The tuner's loop: step, judge on runs that are not learnt from, keep the best, and go on after a stop."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import Array
@@ -16,6 +16,7 @@ from jaxekf.kernels import jit
 from jaxekf.model import Model, Parameters
 from jaxekf.recording import Flags, Floats
 from tuning.data import Data
+from tuning.data import on_host as data_on_host
 from tuning.information import Information, information, of_runs
 from tuning.noise import Layout
 from tuning.objectives import Objective, count, evaluate_each, visible_rows, weights_of
@@ -82,10 +83,15 @@ def on_host(free: Any) -> Any:
     return np.asarray(free)
 
 
-def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Array]:
+def total_counts(groups: Sequence[Data], objective: Objective) -> dict[str, Any]:
     """What each term of the objective is the mean over, of all groups together."""
-    found = [count(data, tuple(weights_of(objective))) for data in groups]
-    return {name: sum((f[name] for f in found), jnp.zeros((), int)) for name in found[0]}
+    found = [count(data_on_host(data), tuple(weights_of(objective))) for data in groups]
+    return {name: sum((f[name] for f in found), np.zeros((), int)) for name in found[0]}
+
+
+def _visible(groups: Sequence[Data]) -> int:
+    """Measured rows of all groups."""
+    return sum(int(visible_rows(data_on_host(data))) for data in groups)
 
 
 @dataclass
@@ -130,19 +136,19 @@ class Descent:
         self._known: Information | None = None
 
     @cached_property
-    def training_counts(self) -> dict[str, Array]:
+    def training_counts(self) -> dict[str, Any]:
         """What the terms are the means over."""
         return total_counts(self.training, self.objective)
 
     @cached_property
-    def validation_counts(self) -> dict[str, Array]:
+    def validation_counts(self) -> dict[str, Any]:
         """The same of the validation runs."""
         return total_counts(self.validation or (), self.objective)
 
     @cached_property
     def _rows(self) -> int:
         """Measured rows of the training runs."""
-        return max(sum(int(visible_rows(data)) for data in self.training), 1)
+        return max(_visible(self.training), 1)
 
     @property
     def information_cost(self) -> int:
@@ -152,7 +158,7 @@ class Descent:
     @cached_property
     def _judging_cost(self) -> float:
         """Filterings of all training runs that as many rows are as the validation runs take."""
-        rows = sum(int(visible_rows(data)) for data in self.validation or ())
+        rows = _visible(self.validation or ())
         own = len(self.layout.own_of_one_run)
         return (1 + (_OWN_STEPS * (2 * own + 1) if own else 0)) * rows / self._rows
 
@@ -161,9 +167,9 @@ class Descent:
         likely = self.objective.likelihood + self.objective.truth
         least = _LEAST_EVIDENCE * likely / self._rows if likely else None
         direction = self._scoring if self.fisher else None
-        return Walk(jnp.asarray(free), self.optimiser, least, direction)
+        return Walk(on_host(free), self.optimiser, least, direction)
 
-    def _scoring(self, free: Array, gradient: Array) -> Array:
+    def _scoring(self, free: Floats, gradient: Floats) -> Floats:
         """The step of Fisher scoring: down the gradient by the inverse of the expected curvature."""
         # A direction is asked for only where value and score were taken just before.
         assert self._known is not None and np.array_equal(self._known.free, on_host(free))
@@ -173,11 +179,11 @@ class Descent:
         curved = curved + np.diag(1e-3 * self.layout.prior**-2.0)
         moving = np.flatnonzero(~self.fixed)
         step = np.zeros(len(gradient))
-        down = -self._rows * np.asarray(gradient)[moving]
+        down = -self._rows * gradient[moving]
         step[moving] = np.linalg.solve(curved[np.ix_(moving, moving)], down)
-        return jnp.asarray(step)
+        return step
 
-    def value_and_gradient(self, free: Any) -> tuple[float, Array]:
+    def value_and_gradient(self, free: Any) -> tuple[float, Floats]:
         """The objective of the training runs, prior included."""
         plain = on_host(free)
         if self.fisher:
@@ -189,18 +195,18 @@ class Descent:
         gradient = sum((np.asarray(gradient) for _, gradient in found), np.zeros(plain.shape))
         return self.completed(plain, sum(float(value) for value, _ in found), gradient)
 
-    def _value_and_score(self, free: Floats) -> tuple[float, Array]:
+    def _value_and_score(self, free: Floats) -> tuple[float, Floats]:
         """The same by the filter alone, from the runs of it that the curvature takes anyway: the gradient
         of a large model takes the compiler longer than all the steps of Fisher scoring."""
         value = self.value(free)
         self.filterings += 1
         if not np.isfinite(value):
-            return value, jnp.zeros(len(free))
+            return value, np.zeros(len(free))
         self._known = information(self.model, self.layout, free, self.base, self.training)
         self.filterings += self.information_cost
         slope = -self.objective.likelihood * self._known.score / self._rows
         slope = np.where(self.fixed, 0.0, slope + self._prior(free)[1])
-        return value, jnp.asarray(slope)
+        return value, slope
 
     def plain_values_and_gradients(self, points: Sequence[Floats]) -> list[tuple[float, Floats]]:
         """Of up to `width` points at once, without the prior."""
@@ -213,11 +219,11 @@ class Descent:
         gradients = sum((np.asarray(slope) for _, slope in found), np.zeros(given[3].shape))
         return [(float(values[i]), gradients[i]) for i in range(len(points))]
 
-    def completed(self, free: Floats, value: float, gradient: Floats) -> tuple[float, Array]:
+    def completed(self, free: Floats, value: float, gradient: Floats) -> tuple[float, Floats]:
         """Value and gradient of the runs with those of the prior, and none along what is fixed."""
         self.evaluations += 1
         prior, slope = self._prior(free)
-        return value + prior, jnp.asarray(np.where(self.fixed, 0.0, gradient + slope))
+        return value + prior, np.where(self.fixed, 0.0, gradient + slope)
 
     def value(self, free: Any) -> float:
         """The objective of the training runs, prior included: one filtering of all of them."""
@@ -323,8 +329,12 @@ class Descent:
 
     def _step(self, patience: int, progress: Progress | None) -> str:
         while len(self.history) < self.iterations:
-            value, gradient = self.value_and_gradient(self.walk.candidate)
-            if reason := self.advance(value, gradient, patience, progress):
+            if not self.history and not self.fisher and self.validation is not None:
+                value, gradient, held = self._first()
+            else:
+                value, gradient = self.value_and_gradient(self.walk.candidate)
+                held = None
+            if reason := self.advance(value, gradient, patience, progress, held):
                 return reason
             if self.keep is not None:
                 self.keep(self.state_dict())
@@ -334,18 +344,40 @@ class Descent:
             )
         return self.all_done
 
+    def _first(self) -> tuple[float, Floats, float]:
+        """Value, gradient and validation value of the first candidate, side by side: most of the time is
+        taken by the compiler, which can work on both programs at once."""
+        plain = on_host(self.walk.candidate)
+        given = self.model, self.objective, self.layout, plain, self.base
+        if self.width == 1:
+            for data in self.training:
+                # Traced before the other thread begins, so that the compiler begins with the larger one.
+                _value_and_gradient.lower(*given, data, self.training_counts)
+        with ThreadPoolExecutor(1) as beside:
+            held = beside.submit(self.validation_value, self.walk.candidate)
+            value, gradient = self.value_and_gradient(self.walk.candidate)
+            return value, gradient, held.result()
+
     @property
     def all_done(self) -> str:
         """The reason to stop after the last iteration."""
         return f"the {self.iterations} iterations asked for are done"
 
     def advance(
-        self, value: float, gradient: Array, patience: int, progress: Progress | None
+        self,
+        value: float,
+        gradient: Floats,
+        patience: int,
+        progress: Progress | None,
+        held: float | None = None,
     ) -> str:
         """Judge the candidate, which has this value and gradient, and choose the next; a reason to stop, or
-        nothing."""
-        finite = np.isfinite(value) and bool(jnp.all(jnp.isfinite(gradient)))
-        held = self.validation_value(self.walk.candidate) if finite else float("nan")
+        nothing. `held` is its validation value where that is known."""
+        finite = np.isfinite(value) and bool(np.all(np.isfinite(gradient)))
+        if not finite:
+            held = float("nan")
+        elif held is None:
+            held = self.validation_value(self.walk.candidate)
         step = Iteration(len(self.history), value, held, not finite)
         self.record(step, self.walk.candidate, progress)
         if step.number - self.since >= patience:

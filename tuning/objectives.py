@@ -227,15 +227,18 @@ def weights_of(objective: Objective) -> dict[str, float]:
 
 
 def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
-    """What each term is the mean over: judged instants, and for the likelihood visible rows."""
+    """What each term is the mean over: judged instants, and for the likelihood visible rows.
+
+    Of NumPy arrays (`tuning.data.on_host`) it compiles nothing.
+    """
     found = {}
     for name in names:
         if name == "likelihood":
             found[name] = visible_rows(data)
         elif name == "truth" and "attitude" in data.truth:
-            found[name] = jnp.sum(data.truth["attitude"].judged)
+            found[name] = data.truth["attitude"].judged.sum()
         elif name in data.truth:
-            found[name] = jnp.sum(data.truth[name].judged)
+            found[name] = data.truth[name].judged.sum()
     return found
 
 
@@ -342,8 +345,8 @@ def _scale(model: Model, name: str) -> float:
 
 def visible_rows(data: Data) -> Array:
     """Number of rows whose likelihood counts."""
-    total = jnp.zeros((), int)
+    total: Any = np.zeros((), int)
     for name, rows in (data.steps.fast | data.steps.slow).items():
         counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
-        total = total + jnp.sum(rows.mask & counted[..., None])
+        total = total + (rows.mask & counted[..., None]).sum()
     return total

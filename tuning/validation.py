@@ -52,6 +52,13 @@ def compare(
     estimates = {
         name: estimate_many(recordings, model, p, smooth=smooth) for name, p in variants.items()
     }
+    return compare_estimates(recordings, estimates)
+
+
+def compare_estimates(
+    recordings: Sequence[Recording], estimates: Mapping[str, Sequence[Estimate]]
+) -> Comparison:
+    """As `compare`, of estimates that are made already: for each variant one of every recording."""
     rows: list[Row] = []
     nan = float("nan")
     for i, recording in enumerate(recordings):
@@ -74,7 +81,8 @@ def compare(
                     judged.position_nees,
                 )
             )
-    return Comparison(rows, estimates, recordings)
+    made = {name: list(every) for name, every in estimates.items()}
+    return Comparison(rows, made, list(recordings))
 
 
 def _tracker_nis(estimate: Estimate) -> float:

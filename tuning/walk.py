@@ -4,14 +4,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
-from jax import Array
+
+from jaxekf.recording import Floats
 
 _MOST_REJECTIONS = 10
 _SMALL_GAIN = 1e-5
 _LONGEST_STEP = 1.0
+_LBFGS = optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
+# Not compiled as a whole it is some eighty programs, two of which are compiled anew at each step.
+_lbfgs_begin, _lbfgs_step = jax.jit(_LBFGS.init), jax.jit(_LBFGS.update)
 _KEPT = ("candidate", "stand", "value", "gradient", "change", "rejections", "small_gains")
 
 
@@ -23,25 +26,30 @@ class Walk:
     optax optimiser of the caller's own is followed as it is, but for steps that are not finite; a
     `direction` of where it stands and the gradient there takes the place of L-BFGS's. Two gains in a row
     of less than `least`, by default a small part of the value, end it.
+
+    All but the optimiser's own arithmetic is done on the host: for a few numbers it is not worth a program.
     """
 
     def __init__(
         self,
-        free: Array,
+        free: Floats,
         optimiser: optax.GradientTransformation | None,
         least: float | None = None,
-        direction: Callable[[Array, Array], Array] | None = None,
+        direction: Callable[[Floats, Floats], Floats] | None = None,
     ) -> None:
         self.least, self.direction = least, direction
         self.monotone = optimiser is None
-        self.optimiser = optimiser or optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
-        self.state = self.optimiser.init(free)
+        begin, self._step = (
+            (_lbfgs_begin, _lbfgs_step) if optimiser is None else (optimiser.init, optimiser.update)
+        )
+        free = np.asarray(free)
+        self.state = begin(jax.device_put(free))
         self.candidate = self.stand = free
         self.value = float("inf")
-        self.gradient = self.change = jnp.zeros_like(free)
+        self.gradient = self.change = np.zeros_like(free)
         self.rejections = self.small_gains = 0
 
-    def move(self, value: float, gradient: Array, finite: bool) -> str:
+    def move(self, value: float, gradient: Floats, finite: bool) -> str:
         """Take or refuse the candidate and choose the next; a reason to stop, or nothing."""
         if not finite or (self.monotone and not self._falls(value)):
             self.rejections += 1
@@ -62,14 +70,15 @@ class Walk:
         self.rejections = 0
         self.stand, self.value, self.gradient = self.candidate, value, gradient
         if self.direction is None:
-            update, self.state = self.optimiser.update(gradient, self.state, self.stand)
-            self.change = jnp.asarray(update)
+            given = jax.device_put((gradient, self.state, self.stand))
+            update, self.state = self._step(*given)
+            self.change = np.asarray(update)
         else:
             self.change = self.direction(self.stand, gradient)
         if self.monotone:
             if float(self.change @ gradient) >= 0.0:
                 self.change = -gradient
-            longest = float(jnp.max(jnp.abs(self.change)))
+            longest = float(np.max(np.abs(self.change)))
             if longest == 0.0:
                 return "converged"
             self.change = self.change * min(1.0, _LONGEST_STEP / longest)
@@ -87,11 +96,10 @@ class Walk:
         for name in _KEPT:
             value = kept[name]
             plain = {"value": float, "rejections": int, "small_gains": int}
-            setattr(self, name, plain[name](value) if name in plain else jnp.asarray(value))
+            setattr(self, name, plain[name](value) if name in plain else np.asarray(value))
         leaves, structure = jax.tree.flatten(self.state)
         again = [
-            jnp.asarray(kept[f"state_{i}"], jnp.asarray(leaf).dtype)
-            for i, leaf in enumerate(leaves)
+            np.asarray(kept[f"state_{i}"], np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)
         ]
         self.state = jax.tree.unflatten(structure, again)
 

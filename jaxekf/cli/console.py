@@ -1,6 +1,5 @@
-"""What the commands share: tables, progress, JSON, and errors as one line."""
+"""What the commands share: options, tables, progress and JSON."""
 
-import errno
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,16 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from jaxekf.cli.commands import WRITTEN
 from jaxekf.description import SCHEMA_VERSION
-from jaxekf.errors import JaxekfError
 from jaxekf.files import finite_or_null
 from jaxekf.models import REGISTRY
-from jaxekf.robust import MEANS
-
-_WRITTEN = "jaxekf.written"
-_SIGINT_STATUS = 130
-"""128 and the number of the signal, as shells have it."""
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+from jaxekf.robust_weights import MEANS
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
@@ -59,49 +53,9 @@ robust_option = click.option(
 )
 
 
-class Commands(click.Group):
-    """A group whose commands turn what can go wrong into one line and a non-zero exit."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except JaxekfError as error:
-            raise click.ClickException(str(error)) from error
-        except BrokenPipeError:
-            raise  # Whoever read has heard enough: click ends in silence.
-        except OSError as error:
-            raise click.ClickException(_of_system(error)) from error
-        except MemoryError as error:
-            raise click.ClickException(
-                f"got too little memory ({str(error) or 'out of memory'}), expected enough for all that was"
-                " named; name fewer or shorter runs at once"
-            ) from error
-        except KeyboardInterrupt:
-            note(_interrupted(ctx.meta.get(_WRITTEN, [])))
-            raise click.exceptions.Exit(_SIGINT_STATUS) from None
-
-
-def _of_system(error: OSError) -> str:
-    """One sentence on what the system refused."""
-    said = error.strerror or " ".join(str(error).split())
-    place = f"{error.filename or 'output'}: got '{said}', expected"
-    if error.errno in _FULL:
-        return f"{place} room to write; free some or name an output on another disk"
-    return f"{place} to read or write there; check the path and its permissions"
-
-
-def _interrupted(written: list[Path]) -> str:
-    """What a command that was stopped leaves behind."""
-    if not written:
-        return "interrupted: nothing was written"
-    more = f" and {len(written) - 3} more" if len(written) > 3 else ""
-    shown = ", ".join(map(str, written[:3]))
-    return f"interrupted: {shown}{more} {'was' if len(written) == 1 else 'were'} finished and kept"
-
-
 def wrote(path: Path) -> None:
     """Say that an output is there, whole; should the command be stopped it is told again."""
-    click.get_current_context().meta.setdefault(_WRITTEN, []).append(path)
+    click.get_current_context().meta.setdefault(WRITTEN, []).append(path)
     note(f"wrote {path}")
 
 

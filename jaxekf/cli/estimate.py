@@ -32,7 +32,7 @@ from jaxekf.online import estimate_online
 from jaxekf.recording import Recording
 from jaxekf.requested import Every, Requested, every, read_requested
 from jaxekf.result import Estimate, trackers
-from jaxekf.robust import Means, robust
+from jaxekf.robust_weights import Means, robust
 
 
 def load_runs(

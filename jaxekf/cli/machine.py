@@ -2,9 +2,12 @@
 
 import os
 from contextlib import suppress
-from pathlib import Path
 
+import click
 import jax
+
+from jaxekf.errors import CacheError
+from jaxekf.program_cache import keep_programs
 
 
 def prepare() -> None:
@@ -15,21 +18,12 @@ def prepare() -> None:
     """
     with suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-    folder = cache_folder()
-    if folder is None:
+    chosen = os.environ.get("JAXEKF_CACHE")
+    if chosen == "":
         return
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-
-
-def cache_folder() -> Path | None:
-    """Where compiled programs are kept; None where they are not."""
-    chosen = os.environ.get("JAXEKF_CACHE")
-    if chosen is not None:
-        return Path(chosen) if chosen else None
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "jaxekf"
+        keep_programs(chosen)
+    except CacheError as error:
+        # A command works without; only who named a folder expects that it is used.
+        if chosen is not None:
+            click.echo(f"compiled programs are not kept: {error}", err=True)

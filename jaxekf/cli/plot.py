@@ -21,7 +21,7 @@ from jaxekf.estimation import estimate_many
 from jaxekf.models import get_model
 from jaxekf.recording import Recording
 from jaxekf.result import Estimate
-from jaxekf.robust import Means, robust
+from jaxekf.robust_weights import Means, robust
 
 FIGURES = tuple(plots.figure_functions())
 

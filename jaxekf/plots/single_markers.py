@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.models import tight
 from jaxekf.plots.sight import look, seconds, shade
 from jaxekf.plots.style import (
@@ -157,12 +157,12 @@ def _nis(axes: Any, t: Floats, record: SensorRecord, gate: float | None) -> None
     rows = record.residual.shape[1]
     used = record.used.any(axis=1)
     gated = record.gated.any(axis=1) & ~used
-    low, high = chi2.ppf([0.025, 0.975], rows)
+    low, high = chi_square.ppf([0.025, 0.975], rows)
     axes.axhspan(low, high, color=ESTIMATE, alpha=0.22, lw=0, label="95 % of honest NIS")
     axes.plot(t[used], record.nis[used], ".", ms=2, color=ESTIMATE, label="NIS, used")
     axes.plot(t[gated], record.nis[gated], "x", ms=4, color=REFUSED, label="NIS, refused")
     axes.axhline(rows, color=TRUTH, lw=1, label="expected mean")
     if gate is not None:
-        axes.axhline(chi2.ppf(gate, rows), color=REFUSED, lw=1, ls="--", label="gate")
+        axes.axhline(chi_square.ppf(gate, rows), color=REFUSED, lw=1, ls="--", label="gate")
     axes.set_yscale("log")
     axes.set_ylim(bottom=1e-2)

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
+from jaxekf import chi_square
 from jaxekf.consistency import BAND
 from jaxekf.metrics import normalised_square
 from jaxekf.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
@@ -93,7 +93,7 @@ def errors(seen: Evidence, bins: int) -> Figure | None:
 def _squares(grid: Grid, at: Place, title: str, squares: Floats, freedom: Floats) -> None:
     """Axis, chi-square band and expected mean of normalised squares."""
     common = float(np.bincount(freedom.astype(int)).argmax()) or 1.0
-    low, high = (float(edge) for edge in chi2.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], common))
+    low, high = (float(edge) for edge in chi_square.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], common))
     known = squares[np.isfinite(squares) & (squares > 0)]
     least = float(np.quantile(known, 0.01)) if known.size else low
     most = float(known.max()) if known.size else high

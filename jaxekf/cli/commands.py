@@ -1,0 +1,89 @@
+"""The group of commands: each is imported when it runs, and what can go wrong becomes one line."""
+
+import errno
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+from click.shell_completion import CompletionItem
+
+from jaxekf.errors import JaxekfError
+
+WRITTEN = "jaxekf.written"
+"""Where a command's context keeps the outputs that are finished."""
+_SIGINT_STATUS = 130
+"""128 and the number of the signal, as shells have it."""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class Place(NamedTuple):
+    """A command that is not imported yet."""
+
+    module: str
+    attribute: str
+    summary: str
+
+
+class Commands(click.Group):
+    """A group that imports a command only to run it: its own help must not cost JAX and SciPy."""
+
+    def __init__(self, *args: Any, places: Mapping[str, Place], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.places = dict(places)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(self.places)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        place = self.places.get(cmd_name)
+        return place and getattr(import_module(place.module), place.attribute)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, self.places[name].summary) for name in sorted(self.places)])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        found = [
+            CompletionItem(name, help=place.summary)
+            for name, place in sorted(self.places.items())
+            if name.startswith(incomplete)
+        ]
+        return found + click.Command.shell_complete(self, ctx, incomplete)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except JaxekfError as error:
+            raise click.ClickException(str(error)) from error
+        except BrokenPipeError:
+            raise  # Whoever read has heard enough: click ends in silence.
+        except OSError as error:
+            raise click.ClickException(_of_system(error)) from error
+        except MemoryError as error:
+            raise click.ClickException(
+                f"got too little memory ({str(error) or 'out of memory'}), expected enough for all that was"
+                " named; name fewer or shorter runs at once"
+            ) from error
+        except KeyboardInterrupt:
+            click.echo(_interrupted(ctx.meta.get(WRITTEN, [])), err=True)
+            raise click.exceptions.Exit(_SIGINT_STATUS) from None
+
+
+def _of_system(error: OSError) -> str:
+    """One sentence on what the system refused."""
+    said = error.strerror or " ".join(str(error).split())
+    place = f"{error.filename or 'output'}: got '{said}', expected"
+    if error.errno in _FULL:
+        return f"{place} room to write; free some or name an output on another disk"
+    return f"{place} to read or write there; check the path and its permissions"
+
+
+def _interrupted(written: list[Path]) -> str:
+    """What a command that was stopped leaves behind."""
+    if not written:
+        return "interrupted: nothing was written"
+    more = f" and {len(written) - 3} more" if len(written) > 3 else ""
+    shown = ", ".join(map(str, written[:3]))
+    return f"interrupted: {shown}{more} {'was' if len(written) == 1 else 'were'} finished and kept"

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jaxekf import lanes, manifold, programs
 from jaxekf.group_derivative import derivative
 from jaxekf.manifold import Euclidean, Manifold
 from jaxekf.model import Model, Parameters, Sensor
-from jaxekf.patterned import Pattern
+from jaxekf.patterned import Pattern, take
 from jaxekf.programs import Constant
 from jaxekf.timeline import Rows
 
@@ -38,7 +38,7 @@ class Jacobian(NamedTuple):
                 if block is None:
                     block = np.zeros((len(above), len(left)), self.dtype)
                 else:
-                    block = taken(taken(block, above, 0), left, 1)
+                    block = take(take(block, above, 0), left, 1)
                 line.append(block)
             found.append(_joined(line, 1))
         return _joined(found, 0)
@@ -50,18 +50,6 @@ class Jacobian(NamedTuple):
     def bands(self, p: Pattern) -> tuple[Array, ...]:
         """The unknown bands of a pattern."""
         return tuple(jnp.asarray(self.part(rows, cols)) for rows, cols in p.bands)
-
-
-def taken(array: Any, index: tuple[int, ...], axis: int) -> Any:
-    """Entries of `array` along `axis`, in ascending order, as slices of consecutive ones."""
-    if len(index) == array.shape[axis]:
-        return array
-    pieces, begin = [], 0
-    for k in range(1, len(index) + 1):
-        if k == len(index) or index[k] != index[k - 1] + 1:
-            pieces.append(lax.slice_in_dim(array, index[begin], index[k - 1] + 1, axis=axis))
-            begin = k
-    return _joined(pieces, axis)
 
 
 def _joined(pieces: list[Any], axis: int) -> Any:

@@ -14,6 +14,7 @@ from scipy.io import savemat
 import jaxekf
 from jaxekf.alignment import align
 from jaxekf.cli import main
+from jaxekf.cli.imports import import_run
 from jaxekf.datasets import asl, broad, formats, ndi, optitrack, repoimu, ros, vicon
 from jaxekf.errors import RecordingError
 from jaxekf.recording import Optical
@@ -509,7 +510,7 @@ def test_options_are_those_of_the_loader(name, tmp_path):
     known = inspect.signature(
         {"asl": asl.load, "ros": ros.load}.get(name, formats.FORMATS[name].load)
     )
-    offered = {option.name for option in main.commands["import"].params}
+    offered = {option.name for option in import_run.params}
     for option in formats.FORMATS[name].options:
         assert option in known.parameters and option in offered
     refused = call(name, tmp_path / "nothing", "-o", tmp_path / "x")

@@ -7,6 +7,7 @@ again from the belief it started from: nothing but beliefs is kept.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxekf import linalg
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
-from jaxekf.own_derivative import inexact, merge, unfilled
+from jaxekf.own_derivative import merge, unfilled
 from jaxekf.step import Moment, Outcome, Track, begin, predict, update
 from jaxekf.system import System
 
@@ -191,17 +192,12 @@ def _cut(tree: Any, segment: int) -> Any:
     return jax.tree.map(cut, tree)
 
 
+@dataclass(frozen=True)
 class _Flags:
-    """Facts about the leaves of a tree that are known when the program is traced."""
+    """Which leaves a derivative is asked by; known when the program is traced."""
 
-    def __init__(self, given: tuple[bool, ...]) -> None:
-        self.given = given
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Flags) and self.given == other.given
-
-    def __hash__(self) -> int:
-        return hash(self.given)
+    prepared: tuple[bool, ...]
+    given: tuple[bool, ...]
 
 
 jax.tree_util.register_static(_Flags)
@@ -211,6 +207,7 @@ def _scan_back(
     system: System,
     what: What,
     segment: int,
+    free: tuple[bool, ...],
     moving: tuple[bool, ...],
     live: tuple[bool, ...],
     starts: Track,
@@ -225,7 +222,8 @@ def _scan_back(
     """
     epochs = given.moments.dt.shape[0]
     every, tree = jax.tree.flatten(_filled(given, segment))
-    floats, moving_prepared = inexact(prepared)
+    values, prepared_tree = jax.tree.flatten(prepared)
+    floats = [v for f, v in zip(free, values, strict=True) if f]
     pulls = _Pulls()
 
     def stretch(carry: Any, at: Any) -> Any:
@@ -234,18 +232,19 @@ def _scan_back(
         def step(track: Track, leaves: list[Array]) -> tuple[Track, list[Array]]:
             def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
                 full = jax.tree.unflatten(tree, merge(moving, moved, leaves))
-                track, kept = _epoch(system, what, True, moving_prepared(floats), track, full)
+                own = jax.tree.unflatten(prepared_tree, merge(free, floats, values))
+                track, kept = _epoch(system, what, True, own, track, full)
                 live_kept = zip(live, jax.tree.leaves(kept), strict=True)
                 return (track, [v for f, v in live_kept if f])
 
             moved = [v for f, v in zip(moving, leaves, strict=True) if f]
             (track, _), pull = jax.vjp(forward, floats, track, moved)
-            return track, pulls.opened(pull, jax.tree.leaves(prepared), leaves)
+            return track, pulls.opened(pull, values, leaves)
 
         def back(carry: Any, at: Any) -> Any:
             after, total = carry
             saved, leaves, cotangents = at
-            pull = pulls.closed(saved, jax.tree.leaves(prepared), leaves)
+            pull = pulls.closed(saved, values, leaves)
             gained, before, of_given = pull((after, cotangents))
             return (before, jax.tree.map(jnp.add, total, gained)), of_given
 
@@ -332,13 +331,10 @@ def _with_adjoint(
         return ahead(None, prepared, first, given)[0]
 
     def forward(prepared: Any, first: First, given: Given) -> Any:
-        flags = tuple(
-            bool(leaf.perturbed) and jnp.issubdtype(leaf.value.dtype, jnp.inexact)
-            for leaf in jax.tree.leaves(given)
-        )
+        flags = _Flags(_perturbed(prepared), _perturbed(given))
         values = jax.tree.map(lambda leaf: leaf.value, (prepared, first, given))
         kept, starts = ahead_saving(None, *values)
-        return kept, (values[0], starts, values[2], _Flags(flags), first.refused is None)
+        return kept, (values[0], starts, values[2], flags, first.refused is None)
 
     def backward(saved: Any, cotangents: Any) -> Any:
         prepared, starts, given, flags, at_rest = saved
@@ -348,15 +344,24 @@ def _with_adjoint(
             not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
         )
         chosen = [c for flag, c in zip(live, every, strict=True) if flag]
-        back = _backward(system, what, segment, devices, flags.given, live)
+        back = _backward(system, what, segment, devices, flags, live)
         total, first, of_given = back(starts, prepared, given, chosen)[0]
         # When samples were refused decides what is let in, but nothing depends on it smoothly.
         refused = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
         back_to_given = unfilled(given, flags.given, of_given)
-        return unfilled(prepared, None, total), First(first, refused), back_to_given
+        back_to_prepared = unfilled(prepared, flags.prepared, total)
+        return back_to_prepared, First(first, refused), back_to_given
 
     function.defvjp(forward, backward, symbolic_zeros=True)
     return function
+
+
+def _perturbed(tree: Any) -> tuple[bool, ...]:
+    """Which leaves, of a `custom_vjp` with symbolic zeros, have a derivative."""
+    return tuple(
+        bool(leaf.perturbed) and jnp.issubdtype(leaf.value.dtype, jnp.inexact)
+        for leaf in jax.tree.leaves(tree)
+    )
 
 
 @lru_cache(maxsize=256)
@@ -365,11 +370,12 @@ def _backward(
     what: What,
     segment: int,
     devices: Devices,
-    moving: tuple[bool, ...],
+    flags: _Flags,
     live: tuple[bool, ...],
 ) -> Callable[..., Any]:
     def scan(starts: Track, *trees: Any) -> Any:
-        return _scan_back(system, what, segment, moving, live, starts, *trees), None
+        asked = (flags.prepared, flags.given, live)
+        return _scan_back(system, what, segment, *asked, starts, *trees), None
 
     def run(starts: Blocks, *trees: Any) -> Any:
         count, size = shape_of(jax.tree.leaves(trees)[0].shape[0], devices)

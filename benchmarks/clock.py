@@ -1,19 +1,75 @@
-"""How long a compiled function takes."""
+"""Time that a function takes: to build its program, and to run it."""
 
 import statistics
+import sys
 import time
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import jax
 
 
-def timed(function: object, *args: object, seconds: float) -> tuple[float, float]:
-    """Seconds of the first call, and the median of later ones."""
+class Build(NamedTuple):
+    """A compiled program, and the seconds of each stage that led to it."""
+
+    program: Any
+    """To be called with arguments like those it was built for."""
+    trace_s: float
+    lower_s: float
+    compile_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of all three stages."""
+        return self.trace_s + self.lower_s + self.compile_s
+
+
+def build(function: Any, *args: Any) -> Build:
+    """Build a jitted function for these arguments, with nothing left of what was built before.
+
+    Programs kept on disk are not forgotten: the caller turns them off (`jax_enable_compilation_cache`).
+    """
+    forget()
+    times = [time.perf_counter()]
+    traced = function.trace(*args)
+    times.append(time.perf_counter())
+    lowered = traced.lower()
+    times.append(time.perf_counter())
+    program = lowered.compile()
+    times.append(time.perf_counter())
+    return Build(program, *(b - a for a, b in pairwise(times)))
+
+
+def forget() -> None:
+    """Clear JAX's caches, and those that the package keeps of models it has seen."""
+    jax.clear_caches()
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] == "jaxekf":
+            for value in list(vars(module).values()):
+                clear = getattr(value, "cache_clear", None)
+                if callable(clear):
+                    clear()
+
+
+def operations(function: Any, *args: Any) -> int:
+    """Number of StableHLO operations of a jitted function: the lines with ``=`` of its lowered text."""
+    text = function.lower(*args).as_text()
+    return sum(" = " in line for line in text.splitlines())
+
+
+def timed(function: Any, *args: Any, seconds: float) -> tuple[float, float]:
+    """Seconds of the first call, and the median of later ones.
+
+    Later calls go on for `seconds`: three at least, or one where it takes five times as long, and thirty
+    at most.
+    """
     begin = time.perf_counter()
     jax.block_until_ready(function(*args))
     first = time.perf_counter() - begin
-    times = []
-    until = time.perf_counter() + seconds
-    while len(times) < 3 or (time.perf_counter() < until and len(times) < 30):
+    times: list[float] = []
+    while not times or (
+        len(times) < 30 and sum(times) < (5.0 * seconds if len(times) < 3 else seconds)
+    ):
         begin = time.perf_counter()
         jax.block_until_ready(function(*args))
         times.append(time.perf_counter() - begin)

@@ -71,8 +71,15 @@ def main() -> None:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
-    quick = parser.parse_args().quick
-    count, shortest, longest, compared = (12, 100, 1_000, 3) if quick else (100, 500, 20_000, 10)
+    parser.add_argument("--smoke", action="store_true", help="two tiny runs, to see that it ends")
+    arguments = parser.parse_args()
+    count, shortest, longest, compared = (100, 500, 20_000, 10)
+    if arguments.quick:
+        count, shortest, longest, compared = (12, 100, 1_000, 3)
+    if arguments.smoke:
+        # Of one length after padding: one program each.
+        count, shortest, longest, compared = (2, 29, 31, 1)
+    iterations = 1 if arguments.smoke else 3
     model = jaxekf.get_model("loose")
     with Progress(disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("simulating", total=5)
@@ -105,7 +112,7 @@ def main() -> None:
         report(result)
         done("tuning")
         tuned, spent = timed(
-            lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=3)
+            lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=iterations)
         )
         programs = descent._value_and_gradient._cache_size()
         timed(lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=1))
@@ -114,7 +121,7 @@ def main() -> None:
     of_tuning = {
         "tune: programs": programs,
         "tune: programs of a second pass": more,
-        "tune: s, 3 iterations": round(spent, 2),
+        f"tune: s, {iterations} iterations": round(spent, 2),
         "tune: objective": [float(step.training) for step in tuned.history],
     }
     report(of_tuning)

@@ -1,29 +1,78 @@
-"""Other models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`."""
+"""Models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`.
+
+The work is the value and the gradient to all parameters of the likelihood of `RUNS` runs, with
+``keep="means"``. Operations are counted at `COUNTED` runs.
+"""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import landmarks
 import numpy as np
-from clock import timed
+from clock import Build, build, operations, timed
 from jax import Array, lax
 from textbook import correct, linearise, predict
 
-from jaxekf import jit, manifold, robust, run_filter_batch
+from jaxekf import get_model, jit, manifold, robust, run_filter_batch
 from jaxekf.ekf import inputs_of
 from jaxekf.interpolation import InputSample
 from jaxekf.model import Belief, Model, Parameters
-from jaxekf.models import loose, marg, triad
 from jaxekf.timeline import Knots, Rows, Steps
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import toy_models
 
-_RUNS, _STEPS, _DT = 64, 500, 0.01
+RUNS, COUNTED = 64, 16
+KINDS = ("forward", "gradient")
+OWN, TEXTBOOK = "jaxekf", "textbook JAX"
+VISUAL = "visual"
+_DT = 0.01
+
+
+def _markers() -> Model:
+    """A toy with an accelerometer before its gyroscope, and the quality of a marker in `aux`."""
+    sensors = tuple(replace(sensor, aux_like=1.0) for sensor in toy_models.MARKERS.sensors)
+    return replace(toy_models.MARKERS, sensors=sensors)
+
+
+CONTENDERS: dict[str, Callable[[], Model]] = {
+    **{
+        name: partial(get_model, name)
+        for name in ("loose", "loose_rate", "loose_pose", "tight", "triad", "marg", VISUAL)
+    },
+    "markers": _markers,
+}
+"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; `visual` as in `vision.py`; a toy
+of 15 degrees of freedom. They have no gates, as textbook JAX has none."""
+MAIN = tuple(name for name in CONTENDERS if name != "markers")
+"""The package's own."""
+
+
+class Measured(NamedTuple):
+    """One program: what it took to build, and to run."""
+
+    build: Build
+    operations: int
+    us: float
+    """Microseconds per step and run."""
+
+
+class Work(NamedTuple):
+    """The same work for both: functions of parameters and data, to means and the likelihood."""
+
+    own: Callable[[Any, Any], tuple[Any, Array]]
+    plain: Callable[[Any, Any], tuple[Any, Array]]
+    params: Any
+    own_data: Any
+    plain_data: Any
+    steps: int
+    """Steps of all runs together."""
 
 
 def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> tuple[Any, Array]:
@@ -42,86 +91,128 @@ def textbook(model: Model, params: Parameters, belief: Belief, steps: Steps) -> 
     return means, jnp.sum(gained)
 
 
-def _steps(model: Model, runs: int) -> Steps:
-    """Plausible input and samples near the start; what they say does not change the work."""
-    rng = np.random.default_rng(2)
-    time = np.broadcast_to(_DT * np.arange(_STEPS)[:, None], (runs, _STEPS, 1))
-    dt = np.full((runs, _STEPS, 1), _DT)
-    dt[:, 0] = 0.0
-    channels = 3 if model.name in ("loose", "triad") else 6
-    values = 0.1 * rng.normal(size=(runs, _STEPS, channels))
+def _knots(model: Model, runs: int, count: int, time: np.ndarray) -> Knots | None:
+    """Plausible input at each step; None for a model without one."""
+    if model.input is None:
+        return None
+    channels = 6 if model.input.name == "imu" else 3
+    values = 0.1 * np.random.default_rng(2).normal(size=(runs, count, channels))
     if channels == 6:
-        # The toy's accelerometer stands before its gyroscope.
-        values[..., 2 if model is toy_models.MARKERS else 5] += 9.81
-    integral = np.concatenate(
-        [np.zeros((runs, 1, channels)), np.cumsum(_DT * (values[:, 1:] + values[:, :-1]) / 2, 1)], 1
-    )
-    shape = (runs, _STEPS, 1)
-    x, u = model.initial_mean({}), InputSample(values[0, 0], values[0, 0], 1.0)
+        values[..., 2 if model.name == "markers" else 5] += 9.81
+    areas = _DT * (values[:, 1:] + values[:, :-1]) / 2
+    integral = np.concatenate([np.zeros((runs, 1, channels)), np.cumsum(areas, axis=1)], axis=1)
+    return Knots(time[..., 0], values, integral)
+
+
+def _steps(model: Model, runs: int, count: int) -> Steps:
+    """Plausible input and samples near the start; their values do not change the work."""
+    shape = (runs, count, 1)
+    time = np.broadcast_to(_DT * np.arange(count)[:, None], shape)
+    dt = np.full(shape, _DT)
+    dt[:, 0] = 0.0
+    knots = _knots(model, runs, count, time)
+    u = None
+    if knots is not None:
+        u = InputSample(knots.value[0, 0], knots.value[0, 0], 1.0)
+    x = model.initial_mean({})
+    params = _arrays(model.parameters)
+    rng = np.random.default_rng(3)
     fast = {}
     for sensor in model.sensors:
-        like = 1.0 if model is toy_models.MARKERS else sensor.aux_like
-        params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
-        said = sensor.predict(x, u, params, like)
+        like = sensor.aux_like
+        expected = sensor.predict(x, u, params, like)
         noise = jnp.asarray(1e-4 * rng.normal(size=(*shape, sensor.rows)))
-        put = jax.vmap(partial(manifold.retract, sensor.space, said))
-        value = np.asarray(put(noise.reshape(-1, sensor.rows))).reshape(*shape, -1)
+        put = jax.jit(jax.vmap(partial(manifold.retract, sensor.space, expected)))
+        value = jax.tree.map(
+            lambda a: np.asarray(a).reshape(*shape, *a.shape[1:]),
+            put(noise.reshape(-1, sensor.rows)),
+        )
         aux = jax.tree.map(lambda a: np.broadcast_to(a, (*shape, *np.shape(a))), like)
         mask = np.ones((*shape, sensor.rows), bool)
         fast[sensor.name] = Rows(value, aux, mask, np.full(shape, _DT))
-    knots = Knots(time[..., 0], values, integral)
-    return Steps(time, dt, np.ones((runs, _STEPS, 1), bool), knots, fast, {})
+    return Steps(time, dt, np.ones(shape, bool), knots, fast, {})
 
 
-CONTENDERS = {
-    "loose": loose.MODEL,
-    "tight": robust("tight", "none"),
-    "triad": triad.MODEL,
-    "marg": marg.MODEL,
-    "markers": robust(toy_models.MARKERS, "none"),
-}
-"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; a toy of 15 degrees of freedom."""
+def _arrays(tree: Any) -> Any:
+    return jax.tree.map(lambda a: jnp.asarray(a, float), tree)
 
 
-def race(seconds: float, names: Sequence[str] = tuple(CONTENDERS)) -> dict[str, dict[str, float]]:
-    """Microseconds per step and run of both, forward and value with gradient to all parameters."""
-    found = {}
+def _repeated(tree: Any, runs: int) -> Any:
+    return jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), tree)
+
+
+def work(name: str, runs: int, count: int) -> Work:
+    """So many runs of a contender, each of about `count` steps."""
+    if name == VISUAL:
+        # Recorded at 100 Hz.
+        one = landmarks.prepare(landmarks.recorded(count * _DT))
+        model, params, belief = one.plain, one.params, one.belief
+        steps = _repeated(one.steps, runs)
+        plain_data = landmarks.of_many(one.flat, runs)
+        filtered, axes = landmarks.textbook, (landmarks.FLAT_AXES,)
+        total = runs * int(np.sum(one.steps.valid))
+    else:
+        model = robust(CONTENDERS[name](), "none")
+        params = _arrays(model.parameters)
+        belief = Belief(model.initial_mean({}), model.initial_covariance(params))
+        steps = plain_data = jax.tree.map(jnp.asarray, _steps(model, runs, count))
+        filtered, axes = textbook, (0,)
+        total = runs * count
+    devices = jax.devices() if runs >= RUNS and len(jax.devices()) > 1 else ()
+
+    def own(params: Any, steps: Any) -> Any:
+        every = _repeated((params, belief), runs)
+        output = run_filter_batch(model, *every, steps, keep="means", devices=devices)
+        means = jax.tree.leaves(output.instants.updated.mean)
+        return means, jnp.sum(output.instants.log_likelihood)
+
+    def plain(params: Any, steps: Any) -> Any:
+        means, gained = jax.vmap(partial(filtered, model, params, belief), axes)(steps)
+        return jax.tree.leaves(means), jnp.sum(gained)
+
+    return Work(own, plain, params, steps, plain_data, total)
+
+
+def programs(made: Work, kinds: Sequence[str]) -> Iterator[tuple[str, str, Any, Any]]:
+    """Kind, whose, jitted function and data of each program of some work."""
+    for kind in kinds:
+        for whose, function, data in (
+            (OWN, made.own, made.own_data),
+            (TEXTBOOK, made.plain, made.plain_data),
+        ):
+            compiled = jit if whose == OWN else jax.jit
+            if kind == "forward":
+                yield kind, whose, compiled(function), data
+            else:
+                slope = jax.value_and_grad(lambda p, s, f=function: f(p, s)[1])
+                yield kind, whose, compiled(slope), data
+
+
+def race(
+    names: Sequence[str],
+    seconds: float,
+    count: int,
+    *,
+    runs: int = RUNS,
+    kinds: Sequence[str] = KINDS,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, dict[str, dict[str, Measured]]]:
+    """Both of each model, by name, kind and whose; they must agree."""
+    found: dict[str, dict[str, dict[str, Measured]]] = {}
     for name in names:
-        model = CONTENDERS[name]
-        params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
-        steps = jax.tree.map(jnp.asarray, _steps(model, _RUNS))
-        x = model.initial_mean({})
-        belief = Belief(x, model.initial_covariance(params))
-
-        def own(params: Any, steps: Any, model: Model = model, belief: Belief = belief) -> Any:
-            every = jax.tree.map(
-                lambda a: jnp.broadcast_to(a, (_RUNS, *jnp.shape(a))), (params, belief)
-            )
-            devices = jax.devices() if len(jax.devices()) > 1 else ()
-            output = run_filter_batch(model, *every, steps, keep="means", devices=devices)
-            return jax.tree.leaves(output.instants.updated.mean), jnp.sum(
-                output.instants.log_likelihood
-            )
-
-        def plain(params: Any, steps: Any, model: Model = model, belief: Belief = belief) -> Any:
-            one = partial(textbook, model, params, belief)
-            means, gained = jax.vmap(one)(steps)
-            return jax.tree.leaves(means), jnp.sum(gained)
-
-        np.testing.assert_allclose(
-            jit(own)(params, steps)[1], jax.jit(plain)(params, steps)[1], rtol=1e-8
-        )
-        found[f"{name}, forward"] = _both(own, plain, (params, steps), seconds)
-        slopes = [jax.value_and_grad(lambda p, s, f=f: f(p, s)[1]) for f in (own, plain)]
-        found[f"{name}, gradient"] = _both(*slopes, (params, steps), seconds)
+        made, counted = work(name, runs, count), work(name, COUNTED, count)
+        for (kind, whose, function, data), (*_, small, few) in zip(
+            programs(made, kinds), programs(counted, kinds), strict=True
+        ):
+            say(f"{name}, {kind}, {whose}")
+            built = build(function, made.params, data)
+            number = operations(small, counted.params, few)
+            us = timed(built.program, made.params, data, seconds=seconds)[1] / made.steps * 1e6
+            result = built.program(made.params, data)
+            value = float(result[1] if kind == "forward" else result[0])
+            of_kind = found.setdefault(name, {}).setdefault(kind, {})
+            of_kind[whose] = Measured(built._replace(program=None), number, us)
+            if whose == OWN:
+                expected = value
+            np.testing.assert_allclose(value, expected, rtol=1e-8, err_msg=f"{name}, {kind}")
     return found
-
-
-def _both(
-    own: Callable[..., Any], plain: Callable[..., Any], args: tuple[Any, ...], seconds: float
-) -> dict[str, float]:
-    """Microseconds per step and run of both."""
-    times = {}
-    for name, function in (("jaxekf", jit(own)), ("textbook JAX", jax.jit(plain))):
-        times[name] = timed(function, *args, seconds=seconds)[1] / (_RUNS * _STEPS) * 1e6
-    return times

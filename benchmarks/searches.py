@@ -4,7 +4,7 @@ Finds 18 numbers, the full 3 x 3 factors of the three noises of `loose`, on simu
 correlated between axes, from a start that is off by factors of 3 to 10. Work is counted in forward
 equivalents: evaluations of the objective, of which one with its gradient counts as many as it takes the
 time of, measured in the same process. Times a whole tuning of ten runs too. Prints tables and, last, one
-line of JSON.
+line of JSON. ``--smoke`` takes one short run, one objective and one iteration.
 """
 
 import argparse
@@ -93,21 +93,24 @@ def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: f
     return over(descent._value_and_gradient) / over(descent._value)
 
 
-def race(runs: Sequence[Recording], objective: str, quick: bool) -> dict[str, Any]:
+def race(
+    runs: Sequence[Recording], objective: str, quick: bool, smoke: bool = False
+) -> dict[str, Any]:
     """The three searches from the same start: work to reach what coordinate search ends with."""
     model = jaxekf.get_model("loose")
     given: dict[str, Any] = {"model": model, "objective": objective, "axes": "full"}
     given["start"] = start_off(model)
-    sweeps = 3 if quick else SWEEPS
+    sweeps = 1 if smoke else 3 if quick else SWEEPS
     coordinates = tuning.tune_by_coordinates(runs, sweeps=sweeps, **given)
     limit = 3 * coordinates.evaluations
     simplex = tuning.tune_by_nelder_mead(runs, evaluations=limit, **given)
-    tuned = tuning.tune(runs, iterations=20 if quick else 60, rescale=False, **given)
-    cost = ratio(model, runs, tuned, 1.0 if quick else 5.0)
+    iterations, seconds = (1, 0.0) if smoke else (20, 1.0) if quick else (60, 5.0)
+    tuned = tuning.tune(runs, iterations=iterations, rescale=False, **given)
+    cost = ratio(model, runs, tuned, seconds)
     aim = coordinates.value
     steps = [i + 1 for i, step in enumerate(tuned.history) if step.training <= aim]
     lower = [step.evaluations for step in simplex.history if step.value <= aim]
-    work = steps[0] * cost if steps else float("nan")
+    work = steps[0] * cost if steps else None
     return {
         "objective": objective,
         "start": coordinates.history[0].value,
@@ -129,7 +132,7 @@ def race(runs: Sequence[Recording], objective: str, quick: bool) -> dict[str, An
         },
         "gradient evaluations": tuned.evaluations,
         "stopped": tuned.stopped,
-        "times fewer": coordinates.history[-1].evaluations / work,
+        "times fewer": coordinates.history[-1].evaluations / work if work else None,
     }
 
 
@@ -145,12 +148,13 @@ def show(found: dict[str, Any]) -> None:
         reach = found["work to reach coordinate search's end"][name]
         table.add_row(
             name,
-            "–" if reach is None or reach != reach else f"{reach:.0f}",
+            "–" if reach is None else f"{reach:.0f}",
             f"{found['work in total'][name]:.0f}",
             f"{value:.6g}",
         )
     Console(width=100).print(table)
-    print(f"times fewer: {found['times fewer']:.1f}; {found['stopped']}", flush=True)
+    fewer = "–" if found["times fewer"] is None else f"{found['times fewer']:.1f}"
+    print(f"times fewer: {fewer}; {found['stopped']}", flush=True)
 
 
 def whole_tuning(count: int, duration_s: float, **how: Any) -> dict[str, Any]:
@@ -183,7 +187,7 @@ def whole_tuning(count: int, duration_s: float, **how: Any) -> dict[str, Any]:
         "seconds each": duration_s,
         "s": spent,
         "s to the first iteration": times[0],
-        "s an iteration": (times[-1] - times[0]) / (len(times) - 1),
+        "s an iteration": (times[-1] - times[0]) / max(len(times) - 1, 1),
         "evaluations": tuned.evaluations,
         "stopped": tuned.stopped,
         "objective": tuned.objective.describe(),
@@ -197,16 +201,22 @@ def main() -> None:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs and searches")
-    quick = parser.parse_args().quick
+    parser.add_argument("--smoke", action="store_true", help="one iteration, to see that it ends")
+    arguments = parser.parse_args()
+    quick, smoke = arguments.quick, arguments.smoke
     # First, so that nothing of it is compiled yet.
     size = (2, 6.0) if quick else (10, 60.0)
-    whole = [whole_tuning(*size, objective="map", optimiser="fisher"), whole_tuning(*size)]
+    if smoke:
+        whole = [whole_tuning(1, 1.0, objective="map", optimiser="fisher", iterations=1)]
+    else:
+        whole = [whole_tuning(*size, objective="map", optimiser="fisher"), whole_tuning(*size)]
     for one in whole:
         print(f"a whole tuning: {one}", flush=True)
-    runs = [correlated(seed, 6.0 if quick else 40.0) for seed in range(2 if quick else 8)]
+    count, length = (1, 1.0) if smoke else (2, 6.0) if quick else (8, 40.0)
+    runs = [correlated(seed, length) for seed in range(count)]
     races = []
-    for objective in ("attitude", "likelihood"):
-        races.append(race(runs, objective, quick))
+    for objective in ("likelihood",) if smoke else ("attitude", "likelihood"):
+        races.append(race(runs, objective, quick, smoke))
         show(races[-1])
     print(json.dumps({"whole tunings": whole, "races": races, "cores": os.cpu_count()}))
 

@@ -1,30 +1,41 @@
 """Race of filters on the same work: ``python benchmarks/speed.py [--quick] [--models marg triad]``.
 
-Prints a table of microseconds per step and run (medians), the first-call seconds and the peak memory, and
-last one line of JSON. All filters must agree before any is timed.
+Prints microseconds per step and run (medians), the first-call seconds and the peak memory of filters of ten
+states; then, for each model of the package against the same model in textbook JAX, the operations of the
+program, the seconds that tracing, lowering and compiling take, and the run time. Build times are those of
+programs of 64 runs, built once each from nothing, without programs kept on disk; operations are lines with
+``=`` of the StableHLO text for 16 runs. All filters must agree. Two CPU devices.
+
+The last line is JSON. ``limit_ratio`` compares ten states and 64 runs with C++ of 8 runs per vector on two
+threads (null where that cannot be built), and the gradient with the forward pass. ``build_ratio`` is
+the gradient's build time over that of textbook JAX's gradient.
 """
 
 import argparse
 import json
-import os
 import platform
 import resource
 import sys
 import time
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 
-jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+DEVICES = 2
+jax.config.update("jax_num_cpu_devices", DEVICES)
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_enable_compilation_cache", False)
 
 import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parent))
 import models  # noqa: E402
 import peers  # noqa: E402
-from clock import timed  # noqa: E402
+from clock import Build, build, operations, timed  # noqa: E402
+from models import KINDS, Measured  # noqa: E402
 from problem import NOISE, STEPS, Noise, measurements  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
@@ -34,140 +45,156 @@ import jaxekf  # noqa: E402
 OURS = "jaxekf"
 """Compiled by `jaxekf.jit`, as `estimate` and `tune` are."""
 PLAIN = "jaxekf, plain jax.jit"
+TEXTBOOK = "textbook JAX"
+PEERS = ("dynamax", "cuthbert")
+RACE = "race"
+"""Name of the model of ten states."""
+TWO_THREADS = "C++ vectors, 2 thread(s)"
+Times = dict[str, dict[str, float]]
+Programs = dict[str, dict[str, dict[str, Measured]]]
 
 
-def contenders() -> dict[str, tuple[object, object]]:
-    """By name: the filter of many runs, and what turns measurements into its input."""
+class Size(NamedTuple):
+    """How much is measured."""
+
+    runs: tuple[int, ...]
+    steps: int
+    """Of a run of ten states."""
+    seconds: float
+    """For which each program is timed."""
+    models: tuple[str, ...]
+    model_steps: int
+    """Of a run of another model."""
+    model_runs: int
+    model_kinds: tuple[str, ...] = KINDS
+    gradients: tuple[str, ...] = (OURS, PLAIN, TEXTBOOK, *PEERS)
+    """Filters of ten states whose gradient is taken."""
+
+
+FULL = Size((1, 64, 1024), STEPS, 3.0, tuple(models.CONTENDERS), 500, models.RUNS)
+QUICK = Size((1, 64), STEPS, 0.5, models.MAIN, 100, models.RUNS)
+SMOKE = Size((2,), 30, 0.0, ("loose",), 30, 2, ("forward",), (OURS, TEXTBOOK))
+
+
+class Contender(NamedTuple):
+    """A filter of many runs, and how it is compiled and fed."""
+
+    run: peers.Filter
+    give: Callable[[np.ndarray], Any]
+    """Makes its input of the measurements."""
+    jit: Callable[..., Any]
+
+    def function(self, kind: str) -> Any:
+        """Means and likelihood, or the likelihood with its gradient to all of Q and R; not built yet."""
+        if kind == "forward":
+            return self.jit(self.run)
+        return self.jit(jax.value_and_grad(lambda noise, given: self.run(noise, given)[1]))
+
+
+def contenders() -> dict[str, Contender]:
+    """Those that are installed, by name."""
     found = {
-        OURS: (peers.ours, peers.given_to_ours),
-        PLAIN: (peers.ours, peers.given_to_ours),
-        "textbook JAX": (peers.over_runs(peers.textbook), jax.numpy.asarray),
+        OURS: Contender(peers.ours, peers.given_to_ours, jaxekf.jit),
+        PLAIN: Contender(peers.ours, peers.given_to_ours, jax.jit),
+        TEXTBOOK: Contender(peers.over_runs(peers.textbook), jax.numpy.asarray, jax.jit),
     }
-    for name in ("dynamax", "cuthbert"):
+    for name in PEERS:
         if peers.available(name):
-            found[name] = (peers.over_runs(getattr(peers, name)), jax.numpy.asarray)
+            one = peers.over_runs(getattr(peers, name))
+            found[name] = Contender(one, jax.numpy.asarray, jax.jit)
     return found
 
 
-def agree(filters: dict[str, tuple[object, object]]) -> None:
-    """Raise unless all filters give the same means and likelihood, and gradients."""
-    z = measurements(3, 300)
-    results = {}
-    for name, (run, give) in filters.items():
-        results[name] = jax.tree.map(np.asarray, jax.jit(run)(NOISE, give(z)))
-    if peers.available("filterpy"):
-        found = [peers.filterpy(NOISE, one) for one in z]
-        results["filterpy"] = np.stack([m for m, _ in found]), sum(t for _, t in found)
+def agree(kind: str, results: dict[str, Any]) -> None:
+    """Raise unless all filters gave the same means and likelihood, or gradients."""
+    if kind == "gradient":
+        slopes = {name: np.concatenate(slope) for name, (_, slope) in results.items()}
+        for name, slope in slopes.items():
+            tolerance = 2e-2 if name == "dynamax" else 1e-5
+            np.testing.assert_allclose(slope, slopes[OURS], rtol=tolerance, err_msg=name)
+        return
     mean, total = results[OURS]
     for name, (other, likelihood) in results.items():
         # dynamax adds 1e-9 to the diagonal of S before it solves, and so differs by that much.
         loose = name == "dynamax"
         np.testing.assert_allclose(other, mean, rtol=0, atol=2e-5 if loose else 1e-8, err_msg=name)
         np.testing.assert_allclose(likelihood, total, rtol=1e-3 if loose else 1e-7, err_msg=name)
-    slopes = {
-        name: np.concatenate(jax.grad(lambda n, g, run=run: run(n, g)[1])(NOISE, give(z)))
-        for name, (run, give) in filters.items()
-    }
-    for name, slope in slopes.items():
-        tolerance = 2e-2 if name == "dynamax" else 1e-5
-        np.testing.assert_allclose(slope, slopes[OURS], rtol=tolerance, err_msg=name)
 
 
-def main() -> None:
-    """Run the race."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer runs, shorter timing")
-    parser.add_argument(
-        "--models",
-        nargs="+",
-        choices=list(models.CONTENDERS),
-        help="these other models alone, against textbook JAX",
-    )
-    arguments = parser.parse_args()
-    quick = arguments.quick
-    if arguments.models:
-        other = models.race(0.5 if quick else 3.0, arguments.models)
-        show_models(Console(width=110), other)
-        print(json.dumps({"other_models_us_per_step_per_run": other}))
-        return
-    filters = contenders()
-    agree(filters)
-    where = {
-        "python": platform.python_version(),
-        "jax": version("jax"),
-        "jaxlib": version("jaxlib"),
-        "devices": f"{len(jax.devices())} {jax.devices()[0].platform}",
-        "processor": processor(),
-    }
-    print(", ".join(f"{key} {value}" for key, value in where.items()))
-    print(
-        "all filters agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)"
-    )
-    sizes = (1, 64) if quick else (1, 64, 1024)
-    seconds = 0.5 if quick else 3.0
-    speed: dict[str, dict[str, float]] = {}
-    first: dict[str, dict[str, float]] = {}
-    for runs in sizes:
-        z = measurements(runs)
-        for name, (run, give) in filters.items():
-            given = give(z)
-            compiled = jaxekf.jit if name == OURS else jax.jit
-            if not (runs == 1024 and name == "cuthbert"):
-                forward = compiled(run)
-                measure(speed, first, name, f"{runs} forward", forward, given, runs, seconds)
-            if runs < 1024:
-                gradient = compiled(jax.value_and_grad(lambda n, g, run=run: run(n, g)[1]))
-                measure(speed, first, name, f"{runs} gradient", gradient, given, runs, seconds)
-    if peers.available("filterpy"):
-        z = measurements(1, 300)[0]
-        begin = time.perf_counter()
-        peers.filterpy(NOISE, z)
-        speed["filterpy"] = {"1 forward": (time.perf_counter() - begin) / len(z) * 1e6}
-    for name, value in peers.yardsticks().items():
-        speed[name] = {"1 forward" if "scalar" in name else "1024 forward": value}
-    other = models.race(seconds)
-    show(speed, first, other)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"peak memory of the whole race: {peak:.0f} MiB")
-    result = {
-        **where,
-        "us_per_step_per_run": speed,
-        "ratios": ratios(speed),
-        "first_call_s": first,
-        "other_models_us_per_step_per_run": other,
-        "peak_memory_mib": round(peak),
-    }
-    print(json.dumps(result))
+class Race(NamedTuple):
+    """The filters of ten states."""
+
+    us: Times
+    """Microseconds per step and run, by filter and column."""
+    first_s: Times
+    """Seconds of the first call, building included."""
+    builds: dict[str, dict[str, Build]]
+    """Builds of the largest gradient and its forward pass, by kind and filter."""
 
 
-def measure(
-    speed: dict[str, dict[str, float]],
-    first: dict[str, dict[str, float]],
-    name: str,
-    column: str,
-    function: object,
-    given: object,
-    runs: int,
-    seconds: float,
-) -> None:
-    """Time one filter and note it."""
-    begin, median = timed(function, Noise(*NOISE), given, seconds=seconds)
-    speed.setdefault(name, {})[column] = median / (runs * STEPS) * 1e6
-    first.setdefault(name, {})[column] = begin
+def race(size: Size, say: Callable[[str], None]) -> Race:
+    """Build, compare and time the filters of ten states."""
+    found = Race({}, {}, {})
+    most = max([runs for runs in size.runs if runs < 1024])
+    for runs in size.runs:
+        z = measurements(runs, size.steps)
+        for kind in KINDS if runs < 1024 else KINDS[:1]:
+            column, results = f"{runs} {kind}", {}
+            for name, one in contenders().items():
+                if runs == 1024 and name == "cuthbert":
+                    continue
+                if kind == "gradient" and name not in size.gradients:
+                    continue
+                say(f"{name}, {column}")
+                given, noise = one.give(z), Noise(*NOISE)
+                built = build(one.function(kind), noise, given)
+                begin, median = timed(built.program, noise, given, seconds=size.seconds)
+                results[name] = jax.tree.map(np.asarray, built.program(noise, given))
+                found.us.setdefault(name, {})[column] = median / (runs * size.steps) * 1e6
+                found.first_s.setdefault(name, {})[column] = built.total_s + begin
+                if runs == most:
+                    found.builds.setdefault(kind, {})[name] = built._replace(program=None)
+            if runs == size.runs[0] and kind == "forward" and peers.available("filterpy"):
+                results["filterpy"] = by_filterpy(z, column, found.us)
+            agree(kind, results)
+    return found
 
 
-def ratios(speed: dict[str, dict[str, float]]) -> dict[str, float]:
-    """What the project asks of itself, from the same run of the script."""
+def by_filterpy(z: np.ndarray, column: str, us: Times) -> tuple[np.ndarray, float]:
+    """Means and likelihood of filterpy, one run after the other."""
+    begin = time.perf_counter()
+    found = [peers.filterpy(NOISE, one) for one in z]
+    us["filterpy"] = {column: (time.perf_counter() - begin) / z[..., 0].size * 1e6}
+    return np.stack([mean for mean, _ in found]), sum(total for _, total in found)
+
+
+def of_ten_states(made: Race, size: Size) -> dict[str, dict[str, Measured]]:
+    """The race's own model as one of the models, by kind and whose."""
+    column = max([runs for runs in size.runs if runs < 1024])
+    z = measurements(models.COUNTED, size.steps)
+    found: dict[str, dict[str, Measured]] = {}
+    for kind, builds in made.builds.items():
+        for name in (OURS, TEXTBOOK):
+            one = contenders()[name]
+            number = operations(one.function(kind), Noise(*NOISE), one.give(z))
+            us = made.us[name][f"{column} {kind}"]
+            found.setdefault(kind, {})[name] = Measured(builds[name], number, us)
+    return found
+
+
+def ratios(speed: Times) -> dict[str, float]:
+    """The project's own aims, from the same run of the script."""
     own = speed[OURS]
     found = {
         f"gradient / forward, 64 runs, {name}": speed[name]["64 gradient"]
         / speed[name]["64 forward"]
         for name in (OURS, PLAIN)
+        if "64 gradient" in speed[name]
     }
     scalar = speed.get("C++ scalar, one thread", {}).get("1 forward")
     vector = [v["1024 forward"] for k, v in speed.items() if k.startswith("C++ vectors")]
     for column, value in own.items():
-        for name in ("dynamax", "textbook JAX", "cuthbert"):
+        for name in (TEXTBOOK, *PEERS):
             if column in speed.get(name, {}):
                 found[f"{name} / jaxekf, {column}"] = speed[name][column] / value
         if scalar and "forward" in column:
@@ -177,50 +204,174 @@ def ratios(speed: dict[str, dict[str, float]]) -> dict[str, float]:
     return {key: round(value, 3) for key, value in found.items()}
 
 
-def show(
-    speed: dict[str, dict[str, float]],
-    first: dict[str, dict[str, float]],
-    other: dict[str, dict[str, float]],
-) -> None:
-    """The tables."""
-    console = Console(width=110)
-    columns = list(speed[OURS])
-    table = Table(title="microseconds per step and run (first call, s)")
+def limit_ratio(speed: Times) -> dict[str, float | None]:
+    """Ten states, 64 runs, two devices: against C++ on two threads, and gradient against forward."""
+    own = speed[OURS]
+    forward, gradient = own.get("64 forward"), own.get("64 gradient")
+    limit = speed.get(TWO_THREADS, {}).get("1024 forward")
+    return {
+        "forward": round(forward / limit, 3) if forward and limit else None,
+        "gradient_over_forward": round(gradient / forward, 3) if forward and gradient else None,
+    }
+
+
+def of_programs(found: Programs) -> dict[str, Any]:
+    """The programs for the line of JSON."""
+
+    def each(whose: str, value: Callable[[Measured], float]) -> dict[str, dict[str, float]]:
+        return {
+            name: {kind: value(both[whose]) for kind, both in kinds.items()}
+            for name, kinds in found.items()
+        }
+
+    own, plain = models.OWN, models.TEXTBOOK
+    return {
+        "operations": each(own, lambda one: one.operations),
+        "build_s": each(own, lambda one: round(one.build.total_s, 2)),
+        "build_ratio": {
+            name: round(one[own].build.total_s / one[plain].build.total_s, 3)
+            for name, kinds in found.items()
+            for kind, one in kinds.items()
+            if kind == "gradient"
+        },
+        "textbook_operations": each(plain, lambda one: one.operations),
+        "textbook_build_s": each(plain, lambda one: round(one.build.total_s, 2)),
+        "other_models_us_per_step_per_run": {
+            f"{name}, {kind}": {whose: one.us for whose, one in both.items()}
+            for name, kinds in found.items()
+            if name != RACE
+            for kind, both in kinds.items()
+        },
+    }
+
+
+def show(console: Console, made: Race) -> None:
+    """The table of filters of ten states."""
+    columns = list(made.us[OURS])
+    table = Table(title="ten states: microseconds per step and run (first call, s)")
     table.add_column("filter")
     for column in columns:
         table.add_column(column, justify="right")
-    for name, row in speed.items():
+    for name, row in made.us.items():
+        first = made.first_s.get(name, {})
         cells = [
-            f"{row[c]:.3f}" + (f" ({first[name][c]:.1f})" if name in first else "")
-            if c in row
-            else ""
+            f"{row[c]:.3f}" + (f" ({first[c]:.1f})" if c in first else "") if c in row else ""
             for c in columns
         ]
         table.add_row(name, *cells)
     console.print(table)
-    show_models(console, other)
-    for name, value in ratios(speed).items():
-        print(f"{name}: {value:g}")
 
 
-def show_models(console: Console, other: dict[str, dict[str, float]]) -> None:
-    """The table of other models."""
-    table = Table(title="other models, 64 runs: microseconds per step and run")
-    for column in ("model", "jaxekf", "textbook JAX", "ratio"):
-        table.add_column(column, justify="left" if column == "model" else "right")
-    for name, row in other.items():
-        own, plain = row["jaxekf"], row["textbook JAX"]
-        table.add_row(name, f"{own:.3f}", f"{plain:.3f}", f"{plain / own:.1f}")
+def show_models(console: Console, found: Programs, runs: int) -> None:
+    """The table of all models: operations, stages of the build, and run time, of both."""
+    table = Table(
+        title=f"models: operations ({models.COUNTED} runs); build and microseconds per step and run"
+        f" ({runs} runs)"
+    )
+    columns = ("operations", "trace + lower + compile, s", "us")
+    table.add_column("", no_wrap=True)
+    for name in (*columns, *(f"textbook {name}" for name in columns), "build ratio", "us ratio"):
+        table.add_column(name, justify="right")
+    for name, kinds in found.items():
+        for kind, both in kinds.items():
+            cells: list[str] = []
+            own, plain = both[models.OWN], both[models.TEXTBOOK]
+            for one in (own, plain):
+                stages = (one.build.trace_s, one.build.lower_s, one.build.compile_s)
+                text = " + ".join(f"{seconds:.1f}" for seconds in stages)
+                cells += [f"{one.operations:,}", text, f"{one.us:.3f}"]
+            cells.append(f"{own.build.total_s / plain.build.total_s:.2f}")
+            cells.append(f"{own.us / plain.us:.3f}")
+            table.add_row(f"{name}, {kind}", *cells)
     console.print(table)
 
 
 def processor() -> str:
-    """Name of the processor, where Linux tells."""
+    """Name of the processor, where Linux gives it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor()
+
+
+def parse_arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer runs, shorter timing")
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it ends")
+    parser.add_argument(
+        "--models",
+        nargs="+",
+        choices=list(models.CONTENDERS),
+        help="these models alone, against textbook JAX (all)",
+    )
+    return parser.parse_args()
+
+
+def race_models(
+    names: Sequence[str], size: Size, found: Programs, say: Callable[[str], None]
+) -> None:
+    """Add the models to what was found."""
+    found |= models.race(
+        names,
+        size.seconds,
+        size.model_steps,
+        runs=size.model_runs,
+        kinds=size.model_kinds,
+        say=say,
+    )
+
+
+def main() -> None:
+    """Run the race."""
+    arguments = parse_arguments()
+    size = SMOKE if arguments.smoke else QUICK if arguments.quick else FULL
+    console, began = Console(width=130), time.perf_counter()
+    found: Programs = {}
+    # The first program that is compiled starts the compiler.
+    jax.block_until_ready(jax.jit(lambda x: x + 1)(1.0))
+    with Console(stderr=True).status("") as status:
+        if arguments.models:
+            race_models(arguments.models, size, found, status.update)
+            show_models(console, found, size.model_runs)
+            print(json.dumps(of_programs(found)))
+            return
+        where = {
+            "python": platform.python_version(),
+            "jax": version("jax"),
+            "jaxlib": version("jaxlib"),
+            "devices": f"{len(jax.devices())} {jax.devices()[0].platform}",
+            "processor": processor(),
+        }
+        print(", ".join(f"{key} {value}" for key, value in where.items()), flush=True)
+        made = race(size, status.update)
+        for name, value in ({} if arguments.smoke else peers.yardsticks()).items():
+            made.us[name] = {"1 forward" if "scalar" in name else "1024 forward": value}
+        show(console, made)
+        found[RACE] = of_ten_states(made, size)
+        race_models(size.models, size, found, status.update)
+    if arguments.smoke:
+        for name in models.CONTENDERS:
+            models.work(name, size.model_runs, size.model_steps)
+    show_models(console, found, size.model_runs)
+    print("all agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)")
+    limits = {f"limit ratio, {name}": value for name, value in limit_ratio(made.us).items()}
+    for name, value in (ratios(made.us) | limits).items():
+        print(f"{name}: {value}")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"peak memory of the whole race: {peak:.0f} MiB")
+    result = {
+        **where,
+        "us_per_step_per_run": made.us,
+        "ratios": ratios(made.us),
+        "first_call_s": made.first_s,
+        **of_programs(found),
+        "limit_ratio": limit_ratio(made.us),
+        "peak_memory_mib": round(peak),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

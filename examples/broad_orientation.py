@@ -12,7 +12,8 @@ trials too):
 Errors are BROAD's: root mean squares over the samples of `movement` of the whole angle between estimate and
 truth, of its turn about the vertical (heading) and of the rest (inclination); no heading offset is removed.
 Frames were checked against the truth: Madgwick's filter of `ahrs` gives north, west, up, all others east,
-north, up. The last line printed is JSON: means over the test trials, and each trial's.
+north, up. The last line printed is JSON: means over the test trials, and each trial's. Filters that are not
+installed are left out. `--smoke` filters a short piece of one trial with the defaults.
 """
 
 import argparse
@@ -22,8 +23,8 @@ import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.util import find_spec
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, NamedTuple
 
 # The tuned filter is compiled in a third of the time so, and what runs then takes seconds.
@@ -35,6 +36,7 @@ jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
+from recorded import parse, piece  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
@@ -222,21 +224,26 @@ def mean(errors: Sequence[OrientationError]) -> OrientationError:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--train", nargs="+", required=True, metavar="TRIAL")
-    parser.add_argument("--test", nargs="+", required=True, metavar="TRIAL")
+    parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL")
+    parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--alone", action="store_true", help="leave the other filters out")
-    return parser.parse_args()
+    arguments = parse(parser, "broad")
+    if arguments.smoke:
+        arguments.train, arguments.test = ["01"], ["02"]
+    if not (arguments.train and arguments.test):
+        parser.error("got no trials, expected --train and --test with numbers of trials")
+    return arguments
 
 
 def ours(
-    trials: Sequence[jaxekf.Recording], params: jaxekf.Parameters
+    trials: Sequence[jaxekf.Recording], params: jaxekf.Parameters, smoke: bool
 ) -> dict[str, list[OrientationError]]:
-    """Errors of the tuned model on each trial, filtered and smoothed."""
+    """Errors of the model on each trial, filtered and smoothed."""
     found = {}
-    for name, smooth in (("filtered", False), ("smoothed", True)):
-        made = jaxekf.estimate_many(trials, marg.MODEL, params, smooth=smooth)
+    # The smoother is a program of its own.
+    for name in ("filtered",) if smoke else ("filtered", "smoothed"):
+        made = jaxekf.estimate_many(trials, marg.MODEL, params, smooth=name == "smoothed")
         found[name] = [
             scored(one.outputs["attitude"].value, one.time_ns, trial.need_encoder())
             for one, trial in zip(made, trials, strict=True)
@@ -244,21 +251,34 @@ def ours(
     return found
 
 
+def installed(package: str) -> bool:
+    """Whether a package can be imported; if not, a sentence says that it is left out."""
+    found = find_spec(package) is not None
+    if not found:
+        print(f'{package} is left out: pip install "jaxekf[bench]"', file=sys.stderr)
+    return found
+
+
 def theirs(
-    training: Sequence[jaxekf.Recording], testing: Sequence[jaxekf.Recording]
+    training: Sequence[jaxekf.Recording], testing: Sequence[jaxekf.Recording], smoke: bool
 ) -> tuple[dict[str, list[OrientationError]], dict[str, Gains]]:
-    """Errors of the other filters on each test trial, and the gains that were found."""
+    """Errors of the other filters that are installed on each test trial, and the gains that were found."""
     found: dict[str, list[OrientationError]] = {}
-    for name, offline in (("vqf", False), ("offline_vqf", True)):
+    for name, offline in (("vqf", False), ("offline_vqf", True)) if installed("vqf") else ():
         found[name] = [
             scored(vqf(t.need_imu(), offline=offline), t.need_imu().time_ns, t.need_encoder())
             for t in testing
         ]
-    chosen = {"madgwick": best(training, [Gains("madgwick", g) for g in MADGWICK])}
-    first = best(training, [Gains("mahony", g, SHARES[1] * g) for g in MAHONY])
-    chosen["mahony"] = best(
-        training, [first._replace(integral=s * first.proportional) for s in SHARES]
-    )
+    if not installed("ahrs"):
+        return found, {}
+    if smoke:
+        chosen = {"madgwick": Gains("madgwick", MADGWICK[0])}
+    else:
+        chosen = {"madgwick": best(training, [Gains("madgwick", g) for g in MADGWICK])}
+        first = best(training, [Gains("mahony", g, SHARES[1] * g) for g in MAHONY])
+        chosen["mahony"] = best(
+            training, [first._replace(integral=s * first.proportional) for s in SHARES]
+        )
     for name, gains in chosen.items():
         found[name] = of_all(testing, [gains], name)[gains]
     return found, chosen
@@ -282,19 +302,25 @@ def main() -> None:
         [broad.load(broad.find(arguments.folder, trial)) for trial in trials]
         for trials in (arguments.train, arguments.test)
     )
-    tuned = tuned_on(training, arguments.iterations)
-    seconds = time.perf_counter() - began
-    found = ours(testing, tuned.params)
+    if arguments.smoke:
+        training, testing = (
+            [piece(run, 60.0, 4.0) for run in runs] for runs in (training, testing)
+        )
+        params, told = start_for(training), "not tuned"
+    else:
+        tuned = tuned_on(training, arguments.iterations)
+        params, seconds = tuned.params, time.perf_counter() - began
+        told = f"tuned in {len(tuned.history)} steps, {seconds:.0f} s: {tuned.stopped}"
+    found = ours(testing, params, arguments.smoke)
     gains: dict[str, Gains] = {}
     if not arguments.alone:
-        others, gains = theirs(training, testing)
+        others, gains = theirs(training, testing, arguments.smoke)
         found |= others
     show(found, arguments.test)
-    print(f"tuned in {len(tuned.history)} steps, {seconds:.0f} s: {tuned.stopped}")
-    noise, calibration = tuned.params.noise, tuned.params.calibration
-    for part in (noise, calibration):
-        told = {k: np.round(np.asarray(v, float), 5).tolist() for k, v in part._asdict().items()}
-        print("  " + ", ".join(f"{name} {value}" for name, value in told.items()))
+    print(told)
+    for part in (params.noise, params.calibration):
+        values = {k: np.round(np.asarray(v, float), 5).tolist() for k, v in part._asdict().items()}
+        print("  " + ", ".join(f"{name} {value}" for name, value in values.items()))
     document: dict[str, Any] = {
         "trials": arguments.test,
         "mean": {name: mean(errors)._asdict() for name, errors in found.items()},

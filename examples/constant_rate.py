@@ -8,6 +8,7 @@ measured, then turns; the tracker is hidden for 0.5 s. For each seed the three m
 tracker held through the occlusion, as in the paper's experiment. With -o the figures are drawn.
 
 The last line is JSON. The exit status is 1 where the recommended model misses what is expected of it.
+With --smoke one seed is estimated by `loose` alone, and nothing is asserted.
 """
 
 import argparse
@@ -100,17 +101,20 @@ def summarise(name: str, records: list[jaxekf.Recording]) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--smoke", action="store_true", help="one seed, `loose` alone")
     parser.add_argument(
         "-o", "--output", type=Path, help="folder for the figures of the first seed"
     )
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    records = [run(seed) for seed in range(arguments.seeds)]
+    models = MODELS[:1] if arguments.smoke else MODELS
+    records = [run(seed) for seed in range(1 if arguments.smoke else arguments.seeds)]
     raw = np.mean([measurement_rmse(record) for record in records], axis=0)
-    table = {name: summarise(name, records) for name in MODELS}
+    table = {name: summarise(name, records) for name in models}
     held_records = [held(record) for record in records]
-    table["loose, tracker held"] = summarise("loose", held_records)
-    table["loose_additive, tracker held"] = summarise("loose_additive", held_records)
+    for name in ("loose", "loose_additive"):
+        if name in models:
+            table[f"{name}, tracker held"] = summarise(name, held_records)
 
     print(f"{'':<30}{'attitude':>10}{'rate':>10}{'occluded':>10}{'bias in 2σ':>12}")
     print(f"{'measurement':<30}{raw[0]:>10.4f}{raw[1]:>10.4f}")
@@ -139,7 +143,7 @@ def main() -> None:
             plots.save(figure, arguments.output / f"{name}.png")
     summary = {"measurement_deg": raw[0], "measurement_deg_s": raw[1], **table}
     print(json.dumps(summary))
-    sys.exit(0 if all(checks.values()) else 1)
+    sys.exit(0 if arguments.smoke or all(checks.values()) else 1)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """An instrument in a surgeon's hand: attitude from accelerometers and a magnetometer, without a gyroscope.
 
-    python examples/microsurgery.py [--minutes 30] [--seed 0] [--output PICTURE.png]
+    python examples/microsurgery.py [--minutes 30] [--seed 0] [--output PICTURE.png] [--smoke]
 
 The simulated system of Ang, Khosla and Riviere at 500 Hz: three dual-axis accelerometers, whose
 differences tell the rate and whose mean tells where down is, and a magnetometer. The model `triad` filters
@@ -10,7 +10,8 @@ the hand turns but does not accelerate, shows whether the filter knows its own e
 
 Half an hour, 900,000 steps, is filtered in one piece and takes some 4 GB of memory.
 
-The last line is JSON; the exit status is 1 where a figure is missed.
+The last line is JSON; the exit status is 1 where a figure is missed. With --smoke half a minute is
+estimated, and nothing is asserted.
 """
 
 import argparse
@@ -272,7 +273,10 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0, help="at least 0.5")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="file for the picture (PNG)")
+    parser.add_argument("--smoke", action="store_true", help="half a minute, nothing is asserted")
     arguments = parser.parse_args()
+    if arguments.smoke:
+        arguments.minutes = 0.5
     if arguments.minutes < 0.5:
         parser.error(f"got --minutes {arguments.minutes:g}, expected at least 0.5; make it longer")
     jax.config.update("jax_enable_x64", True)
@@ -295,7 +299,7 @@ def main() -> None:
     if arguments.output is not None:
         print(f"picture: {style.save(picture(made[0]), arguments.output)}")
     print(json.dumps(found | {"checks": checks}))
-    sys.exit(0 if all(checks.values()) else 1)
+    sys.exit(0 if arguments.smoke or all(checks.values()) else 1)
 
 
 if __name__ == "__main__":

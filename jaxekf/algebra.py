@@ -108,7 +108,8 @@ def congruence_with_adjoint(p: Pattern) -> Any:
         return _doubled(p, bands, half), (bands, half)
 
     def backward(saved: Any, cotangent: Array) -> Any:
-        return _congruence_pullback(p, *saved, False, cotangent)
+        bands, half = saved
+        return _congruence_pullback(p, bands, half, False, cotangent)
 
     function.defvjp(forward, backward)
     return function
@@ -237,8 +238,9 @@ def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Ta
     """The state after rows of diagonal noise, the smallest variance of an innovation, and each row taken.
 
     A row h of variance r with ``S = h' P h + r`` and gain ``k = P h / S`` makes Joseph's
-    ``(I - k h') P (I - k h')' + k r k'``, in the order ``P - k (P h)' + (k r - (P - k (P h)') h) k'``: a gain
-    that is rounded then counts only to the second order. The covariance stays symmetric but for rounding.
+    ``(I - k h') P (I - k h')' + k r k'``, in the order ``P - k (P h)' + (k r - (P - k (P h)') h) k'``: a
+    gain that is rounded then counts only to the second order. The covariance stays symmetric but for
+    rounding.
     """
     cov, delta, log_likelihood = gained
     taken, variances, squares = [], [], []

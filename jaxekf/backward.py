@@ -169,7 +169,8 @@ def _before_update(
 
 
 def before_rows(p: Pattern, kept: Any, info: Information) -> Information:
-    """``A' a + h s`` and ``A' L A + h h' / S`` with ``A = I - k h'``, of rows that `step.take_keeping` took."""
+    """``A' a + h s`` and ``A' L A + h h' / S`` with ``A = I - k h'``, of rows that `step.take_keeping`
+    took."""
     rows, taken = kept
     if many.are_many(rows.mask):
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jaxekf import lanes, programs, rotation
 from jaxekf.lanes import Fixed
@@ -236,7 +236,7 @@ def _rotate_inverse(found: Any, values: list[Any], by: list[dict[int, Any]]) -> 
 
 def _to_matrix(found: Any, values: list[Any], by: list[dict[int, Any]]) -> Tangent:
     # Column j of R [theta] is R (theta x e_j).
-    turned = jnp.stack([-(found @ rotation.skew(e)) for e in np.eye(3)], axis=1)
+    turned = jnp.stack([-(found @ rotation.skew(jnp.asarray(e))) for e in np.eye(3)], axis=1)
     return Tangent(False, {part: turned @ columns for part, columns in by[0].items()})
 
 
@@ -330,11 +330,9 @@ def _columns(
 
 
 def _fitted(columns: Any, operation: Operation, count: int) -> Any:
-    """Columns of a scalar operand in the shape of the result."""
+    """Columns of a scalar or one wide operand in the shape of the result."""
     shape = (*operation.shapes[0].shape, count)
-    if columns.shape == shape:
-        return columns
-    return lax.broadcast_in_dim(columns, shape, (len(shape) - 1,))
+    return columns if columns.shape == shape else lanes.widened(columns, shape)
 
 
 def _is_elementwise(operation: Operation) -> bool:

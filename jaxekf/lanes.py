@@ -162,9 +162,13 @@ def _to_shape(operand: Any, shape: tuple[int, ...]) -> Any:
     if isinstance(operand, Fixed):
         value = operand.value
         return lax.broadcast_in_dim(jnp.asarray(value), shape, tuple(range(np.ndim(value))))
-    if operand.ndim < len(shape):
-        return lax.broadcast_in_dim(operand, shape, (len(shape) - 1,))
-    return operand
+    return operand if operand.shape == shape else widened(operand, shape)
+
+
+def widened(array: Any, shape: tuple[int, ...]) -> Array:
+    """A scalar with lanes, or an array that is one wide where `shape` is not, in that shape."""
+    places = range(len(shape)) if array.ndim == len(shape) else (len(shape) - 1,)
+    return lax.broadcast_in_dim(array, shape, tuple(places))
 
 
 def _whole(operation: Operation, operands: list[Any]) -> list[Any]:

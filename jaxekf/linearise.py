@@ -127,8 +127,8 @@ def linearise_transition(
 ) -> tuple[Any, Array, Array]:
     """The predicted state and the Jacobians F (n, n) and G (n, n_w) of its error vector, for one run.
 
-    ``F`` is with respect to the error of ``x``, ``G`` to the process noise; both in the tangent space at the
-    prediction.
+    ``F`` is with respect to the error of ``x``, ``G`` to the process noise; both in the tangent space at
+    the prediction.
     """
     found = transition_blocks(model, params, x, u, dt)
     return found.mean, found.f.dense(), found.g.dense()

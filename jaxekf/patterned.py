@@ -37,7 +37,7 @@ class Pattern:
     def transposed(self) -> "Pattern":
         """The pattern of the transposed matrix; its bands are those of `transpose`."""
         bands = tuple((cols, rows) for rows, cols in self.bands)
-        return Pattern(self.shape[::-1], _nested(self.base.T), bands)
+        return Pattern((self.shape[1], self.shape[0]), _nested(self.base.T), bands)
 
     @property
     def is_identity(self) -> bool:

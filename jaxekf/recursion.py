@@ -160,7 +160,7 @@ def _scan(
 
 
 def _filled(given: Given, segment: int) -> Given:
-    """`given` with inert steps at the end, so that segments divide it: no time passes and no row is visible.
+    """`given` with inert steps at the end, so that segments divide it: no time passes, no row is visible.
 
     All else is as at the last step, for a sampling period of zero, say, would divide the noise.
     """
@@ -220,8 +220,8 @@ def _scan_back(
 ) -> tuple[Any, Belief, list[Array]]:
     """Cotangents of what was prepared, of the first belief, and of the moving leaves of `given`.
 
-    `cotangents` are those of the live leaves of `Kept`; the others have none. A segment is filtered again from
-    its start, and what the derivative of each epoch needs is kept until the way back through it.
+    `cotangents` are those of the live leaves of `Kept`; the others have none. A segment is filtered again
+    from its start, and what the derivative of each epoch needs is kept until the way back through it.
     """
     epochs = given.moments.dt.shape[0]
     every, tree = jax.tree.flatten(_filled(given, segment))
@@ -404,8 +404,8 @@ def _symmetric(cotangents: Kept) -> Kept:
 def segment_length(epochs: int, substeps: int, bytes_per_belief: int) -> int:
     """Epochs between kept beliefs.
 
-    What the derivatives of the epochs of a segment need, about `_BELIEFS_PER_STEP` beliefs a substep, should
-    stay in the second cache; with very many epochs the beliefs kept should not fill the memory.
+    What the derivatives of the epochs of a segment need, about `_BELIEFS_PER_STEP` beliefs a substep,
+    should stay in the second cache; with very many epochs the beliefs kept should not fill the memory.
     """
     fitting = _CACHE_BYTES // (_BELIEFS_PER_STEP * substeps * bytes_per_belief)
     segment = min(max(fitting, 2), _LONGEST_SEGMENT)

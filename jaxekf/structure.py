@@ -1,9 +1,9 @@
 """Entries of arrays that never change, whatever the state, input and parameters.
 
-A Jacobian is mostly zeros and ones: parts of a state that only walk, sensors that read one part of it. The
-operations of a program are followed entry by entry: zero times anything is zero, and an operation that is not
-listed here makes unknown numbers. So an entry that is called known has that value always; nothing is sampled,
-and nothing needs to be declared.
+A Jacobian is mostly zeros and ones: parts of a state that only walk, sensors that read one part of it.
+The operations of a program are followed entry by entry: zero times anything is zero, and an operation
+that is not listed here makes unknown numbers. So an entry that is called known has that value always;
+nothing is sampled, and nothing needs to be declared.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax import core
 from numpy.typing import NDArray
 
 from jaxekf.programs import Constant, Operation, Program, opened, without_dead
@@ -100,7 +101,7 @@ def _followed(program: Program) -> dict[int, Known]:
 def _read(operand: Any, values: dict[int, Known]) -> Known:
     if not isinstance(operand, Constant):
         return values[operand]
-    if isinstance(operand.value, jax.core.Tracer):
+    if isinstance(operand.value, core.Tracer):
         return _unknown(operand.value)
     value = np.asarray(operand.value)
     return Known(value, np.ones(value.shape, bool))

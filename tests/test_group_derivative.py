@@ -1,4 +1,4 @@
-"""Derivatives on the manifold: rotations by closed forms, everything else by JAX, and what falls out of both."""
+"""Derivatives on the manifold: rotations by closed forms, everything else by JAX."""
 
 import jax
 import jax.numpy as jnp

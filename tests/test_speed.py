@@ -59,7 +59,7 @@ def test_what_is_not_understood_is_not_called_known():
 
 @pytest.mark.parametrize("name", ["plain", "sort", "cumsum", "while", "cond", "solve"])
 def test_values_on_lanes_are_those_of_the_function(name):
-    """A rule that moves an axis to the wrong place, or an operation without one put back in the wrong order."""
+    """A rule that moves an axis to the wrong place, or an operation without one put back wrongly."""
     functions = {
         "plain": lambda x, m: (
             jnp.where(

@@ -246,12 +246,8 @@ class Descent:
         counts, where, plain = self.validation_counts, self.layout, on_host(free)
         if where.own:
             where, plain = self._with_own(plain)
-        return float(
-            sum(
-                _value(self.model, self.objective, where, plain, self.base, data, counts)
-                for data in self.validation
-            )
-        )
+        given = self.model, self.objective, where, plain, self.base
+        return sum(float(_value(*given, data, counts)) for data in self.validation)
 
     def _with_own(self, free: Any) -> tuple[Layout, Floats]:
         """The layout of the validation runs and a vector with their own parameters, a little nearer to the

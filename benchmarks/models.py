@@ -148,15 +148,15 @@ def work(name: str, runs: int, count: int) -> Work:
         one = landmarks.prepare(landmarks.recorded(count * _DT))
         model, params, belief = one.plain, one.params, one.belief
         steps = _repeated(one.steps, runs)
-        plain_data = landmarks.of_many(one.flat, runs)
-        filtered, axes = landmarks.textbook, (landmarks.FLAT_AXES,)
+        plain_data, axes = landmarks.of_many(one.flat, runs)
+        filtered = landmarks.textbook
         total = runs * int(np.sum(one.steps.valid))
     else:
         model = robust(CONTENDERS[name](), "none")
         params = _arrays(model.parameters)
         belief = Belief(model.initial_mean({}), model.initial_covariance(params))
         steps = plain_data = jax.tree.map(jnp.asarray, _steps(model, runs, count))
-        filtered, axes = textbook, (0,)
+        filtered, axes = textbook, 0
         total = runs * count
     devices = jax.devices() if runs >= RUNS and len(jax.devices()) > 1 else ()
 
@@ -167,7 +167,7 @@ def work(name: str, runs: int, count: int) -> Work:
         return means, jnp.sum(output.instants.log_likelihood)
 
     def plain(params: Any, steps: Any) -> Any:
-        means, gained = jax.vmap(partial(filtered, model, params, belief), axes)(steps)
+        means, gained = jax.vmap(partial(filtered, model, params, belief), (axes,))(steps)
         return jax.tree.leaves(means), jnp.sum(gained)
 
     return Work(own, plain, params, steps, plain_data, total)

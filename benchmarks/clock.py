@@ -17,6 +17,8 @@ class Build(NamedTuple):
     trace_s: float
     lower_s: float
     compile_s: float
+    operations: int
+    """StableHLO operations: the lines with ``=`` of the lowered text."""
 
     @property
     def total_s(self) -> float:
@@ -37,7 +39,7 @@ def build(function: Any, *args: Any) -> Build:
     times.append(time.perf_counter())
     program = lowered.compile()
     times.append(time.perf_counter())
-    return Build(program, *(b - a for a, b in pairwise(times)))
+    return Build(program, *(b - a for a, b in pairwise(times)), _operations(lowered))
 
 
 def forget() -> None:
@@ -52,19 +54,32 @@ def forget() -> None:
 
 
 def operations(function: Any, *args: Any) -> int:
-    """Number of StableHLO operations of a jitted function: the lines with ``=`` of its lowered text."""
-    text = function.lower(*args).as_text()
-    return sum(" = " in line for line in text.splitlines())
+    """Number of StableHLO operations of a jitted function for these arguments."""
+    return _operations(function.lower(*args))
 
 
-def timed(function: Any, *args: Any, seconds: float) -> tuple[float, float]:
-    """Seconds of the first call, and the median of later ones.
+def _operations(lowered: Any) -> int:
+    return sum(" = " in line for line in lowered.as_text().splitlines())
+
+
+class Timing(NamedTuple):
+    """Times of a function."""
+
+    first_s: float
+    """Seconds of the first call."""
+    median_s: float
+    """Median of later calls."""
+    result: Any
+
+
+def timed(function: Any, *args: Any, seconds: float) -> Timing:
+    """Time a function.
 
     Later calls go on for `seconds`: three at least, or one where it takes five times as long, and thirty
     at most.
     """
     begin = time.perf_counter()
-    jax.block_until_ready(function(*args))
+    result = jax.block_until_ready(function(*args))
     first = time.perf_counter() - begin
     times: list[float] = []
     while not times or (
@@ -73,4 +88,4 @@ def timed(function: Any, *args: Any, seconds: float) -> tuple[float, float]:
         begin = time.perf_counter()
         jax.block_until_ready(function(*args))
         times.append(time.perf_counter() - begin)
-    return first, statistics.median(times)
+    return Timing(first, statistics.median(times), result)

@@ -108,16 +108,17 @@ def flattened(steps: Steps) -> Any:
     return jax.tree.map(jnp.asarray, given)
 
 
-FLAT_AXES = (None, None, Rows(0, None, None, None), Rows(0, None, None, None))
-"""Axes of `flattened` steps of many runs for `vmap`: only values differ between runs. Masks are shared, so
-that `lax.cond` still leaves out the instants without an image."""
+def of_many(flat: Any, runs: int) -> tuple[Any, Any]:
+    """`flattened` steps with the values repeated for each run on a new first axis, and axes for `vmap`.
 
-
-def of_many(flat: Any, runs: int) -> Any:
-    """`flattened` steps with the values repeated for each of the runs on a new first axis."""
+    Only values have that axis. Masks are shared, so that `lax.cond` still leaves out the instants without
+    an image.
+    """
 
     def each(rows: Rows) -> Rows:
         return rows._replace(value=jnp.broadcast_to(rows.value, (runs, *rows.value.shape)))
 
     valid, dt, fast, camera = flat
-    return valid, dt, {name: each(rows) for name, rows in fast.items()}, each(camera)
+    axes = Rows(0, None, None, None)
+    repeated = valid, dt, {name: each(rows) for name, rows in fast.items()}, each(camera)
+    return repeated, (None, None, dict.fromkeys(fast, axes), axes)

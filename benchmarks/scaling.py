@@ -164,7 +164,7 @@ def measure(point: Point) -> Point:
     forward = point.kind == "forward"
     function = jit(total if forward else jax.value_and_grad(total, has_aux=True))
     base = _resident()
-    first, each = timed(function, noise, given, seconds=_SECONDS)
+    first, each, _ = timed(function, noise, given, seconds=_SECONDS)
     return Point(
         **{
             **vars(point),

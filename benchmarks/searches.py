@@ -88,7 +88,7 @@ def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: f
         def all_groups() -> Any:
             return [function(*given, data, counts) for data in groups]
 
-        return timed(all_groups, seconds=seconds)[1]
+        return timed(all_groups, seconds=seconds).median_s
 
     return over(descent._value_and_gradient) / over(descent._value)
 

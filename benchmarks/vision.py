@@ -60,8 +60,8 @@ def race(run: Recording, least_s: float, *, smoke: bool) -> dict[str, tuple[floa
     results: dict[str, Any] = {}
     for name, function in chosen.items():
         steps = one.flat if name.startswith("textbook") else one.steps
-        found[name] = timed(function, one.free, steps, seconds=least_s)
-        results[name] = function(one.free, steps)
+        first, median, results[name] = timed(function, one.free, steps, seconds=least_s)
+        found[name] = first, median
     valid = np.asarray(one.steps.valid)
     ours, theirs = results[PLAIN], results[TEXTBOOK]
     for a, b in zip(jax.tree.leaves(ours[0]), jax.tree.leaves(theirs[0]), strict=True):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.experimental.xla_metadata import set_xla_metadata
 
 from jaxekf.programs import Constant, Operation, Program, opened
 
@@ -59,7 +60,15 @@ _LONGEST = 64.0
 
 def stage(tree: Any) -> Any:
     """The same tree, each of its arrays computed once and kept."""
-    return jax.tree.map(lax.optimization_barrier, tree)
+    return jax.tree.map(_kept, tree)
+
+
+def _kept(array: Array) -> Array:
+    if jax.__version_info__ >= (0, 11):
+        return lax.optimization_barrier(array)
+    # Before, XLA on a CPU took barriers away before it fused; a call that is not inlined stays.
+    with set_xla_metadata(inlineable="false", xla_cpu_small_call="false"):
+        return jax.jit(lax.optimization_barrier)(array)
 
 
 def written_sum(terms: Sequence[Array]) -> Array:

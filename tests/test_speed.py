@@ -210,8 +210,7 @@ def test_segments_change_nothing(monkeypatch):
         )(params)
 
     whole = slopes()
-    monkeypatch.setattr(recursion, "_CACHE_BYTES", 0)
-    monkeypatch.setattr(recursion, "_SEGMENT", 5)
+    monkeypatch.setattr(recursion, "segment_length", lambda *sizes: 5)
     assert_tree_close(slopes(), whole, 1e-12)
     recursion._with_adjoint.cache_clear()
 

@@ -17,9 +17,10 @@ from jaxekf.system import (
     Measurement,
     Piece,
     Transition,
+    both_jacobians,
     measurement,
     noise_of,
-    pattern_of,
+    patterns_of,
     specified,
 )
 
@@ -91,8 +92,7 @@ def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     w = jax.ShapeDtypeStruct(jax.eval_shape(model.process_noise, params, dt).shape[:1], dt.dtype)
     linearised = partial(linearise.between_blocks, model)
     spec = (params, x, x, w, u, dt)
-    state = pattern_of(lambda *args: linearised(*args).f, *spec)
-    noise = pattern_of(lambda *args: linearised(*args).g, *spec)
+    state, noise = patterns_of(lambda *args: both_jacobians(linearised(*args)), *spec)
 
     def step(*args: Any) -> Any:
         found = linearised(*args)

@@ -205,33 +205,25 @@ def innovation_covariance(p: Pattern, bands: Bands, noise: Array, cov: Array) ->
     return spread + (on_diagonal(noise) if noise.ndim == 2 else noise)
 
 
-def whitened(p: Pattern, rows: Rows) -> tuple[Pattern, Rows]:
-    """The same rows with noise of covariance one each, where it was not diagonal: multiplied by the inverse
-    of the Cholesky factor of the visible rows' noise. The likelihood wants `whitening_likelihood` more."""
+def whitened(p: Pattern, rows: Rows) -> tuple[Pattern, Rows, Array | None]:
+    """The same rows with unit variances where their noise was not diagonal: multiplied by the inverse of
+    the Cholesky factor of the visible rows' noise. Its log-determinant, (lanes,), is to be added to the
+    log-likelihood; None where nothing was multiplied."""
     if rows.noise.ndim == 2:
-        return p, rows
-    white = _whitener(rows)
+        return p, rows, None
+    white = stage(linalg.whitener(linalg.mask_covariance(rows.noise, rows.mask)))
     lanes, dtype = rows.mask.shape[-1], rows.noise.dtype
     full = patterned.whole(p)
     matrix = patterned.cut(patterned.dense(p, rows.slope, lanes, dtype), full)
     slope = tuple(stage(linalg.whiten(white, band)) for band in matrix)
     residual = stage(linalg.whiten(white, rows.residual))
-    return full, Rows(residual, slope, jnp.ones_like(residual), rows.mask)
+    determinant = written_sum([jnp.log(inverse) for inverse in white[1]])
+    return full, Rows(residual, slope, jnp.ones_like(residual), rows.mask), determinant
 
 
 def pattern_taken(p: Pattern, rows: Rows) -> Pattern:
     """The pattern of the rows that `whitened` makes of these, whose own is `p`."""
     return p if rows.noise.ndim == rows.mask.ndim else patterned.whole(p)
-
-
-def _whitener(rows: Rows) -> tuple[Array, Array]:
-    return stage(linalg.whitener(linalg.mask_covariance(rows.noise, rows.mask)))
-
-
-def whitening_likelihood(rows: Rows) -> Array:
-    """``log det inv(L)`` of what `whitened` multiplied by."""
-    inverses = _whitener(rows)[1]
-    return written_sum([jnp.log(inverses[i]) for i in range(inverses.shape[0])])
 
 
 def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Taken]]:

@@ -171,13 +171,7 @@ def _to_shape(operand: Any, shape: tuple[int, ...]) -> Any:
     if isinstance(operand, Fixed):
         value = operand.value
         return lax.broadcast_in_dim(jnp.asarray(value), shape, tuple(range(np.ndim(value))))
-    return operand if operand.shape == shape else widened(operand, shape)
-
-
-def widened(array: Any, shape: tuple[int, ...]) -> Array:
-    """A scalar with lanes, or an array that is one wide where `shape` is not, in that shape."""
-    places = range(len(shape)) if array.ndim == len(shape) else (len(shape) - 1,)
-    return lax.broadcast_in_dim(array, shape, tuple(places))
+    return operand if operand.shape == shape else along(operand, shape, *range(operand.ndim - 1))
 
 
 def _whole(operation: Operation, operands: list[Any]) -> list[Any]:
@@ -220,7 +214,7 @@ def _own_cost(operation: Operation) -> float:
         return 0.0
     if name == "custom_jvp_call":
         return sum(map(_own_cost, opened(operation).operations))
-    if name == "dot_general" or name.startswith("reduce"):
+    if name == "dot_general" or name in _REDUCTIONS:
         return float(_reads_each(operation))
     return _COSTLY.get(name, 1.0)
 
@@ -263,7 +257,7 @@ def _like(change: Callable[[dict[str, Any], int, int], dict[str, Any]]) -> Rule:
 
 def _broadcast(operation: Operation, operands: list[Any], lanes: int) -> list[Any]:
     shape, places = operation.params["shape"], operation.params["broadcast_dimensions"]
-    return [lax.broadcast_in_dim(operands[0], (*shape, lanes), (*places, len(shape)))]
+    return [along(operands[0], (*shape, lanes), *places)]
 
 
 def _pad(operation: Operation, operands: list[Any], lanes: int) -> list[Any] | None:
@@ -321,7 +315,7 @@ def _widened(array: Array, shape: tuple[int, ...], places: dict[int, int]) -> Ar
     axes = sorted(range(array.ndim - 1), key=lambda a: places[a])
     if axes != list(range(array.ndim - 1)):
         array = lax.transpose(array, (*axes, array.ndim - 1))
-    return lax.broadcast_in_dim(array, shape, (*sorted(places.values()), len(shape) - 1))
+    return along(array, shape, *sorted(places.values()))
 
 
 _REDUCTIONS = {

@@ -64,9 +64,9 @@ def pattern(matrix: Known) -> Pattern:
     base = np.where(unknown, 0.0, matrix.value)
     bands = []
     for rows in groups:
-        cols = np.flatnonzero(unknown[rows].any(axis=0))
+        cols = [int(c) for c in np.flatnonzero(unknown[rows].any(axis=0))]
         base[np.ix_(rows, cols)] = 0.0
-        bands.append((tuple(rows), tuple(map(int, cols))))
+        bands.append((tuple(rows), tuple(cols)))
     return Pattern((base.shape[0], base.shape[1]), _nested(base), tuple(bands))
 
 
@@ -82,16 +82,6 @@ def whole(p: Pattern) -> Pattern:
         used[list(cols)] = True
     unknown = np.broadcast_to(used, p.shape)
     return pattern(Known(np.zeros(p.shape), ~unknown))
-
-
-def stack(patterns: Sequence[Pattern]) -> Pattern:
-    """The pattern of matrices with the same columns, one below the other; the bands are those of all."""
-    bands, start = [], 0
-    for p in patterns:
-        bands += [(tuple(start + r for r in rows), cols) for rows, cols in p.bands]
-        start += p.shape[0]
-    base = np.concatenate([p.base for p in patterns])
-    return Pattern((base.shape[0], base.shape[1]), _nested(base), tuple(bands))
 
 
 def take(array: Array, index: Sequence[int], axis: int) -> Array:

@@ -42,7 +42,7 @@ def keep_programs(folder: Path | str | None = None) -> Path:
             f"{place}: got '{error.strerror or error}', expected a folder that can be written, to keep"
             " compiled programs; name another folder"
         ) from error
-    if jax.config.jax_compilation_cache_dir not in (None, str(place)):
+    if jax.config.values["jax_compilation_cache_dir"] not in (None, str(place)):
         # JAX opens its first folder for good.
         compilation_cache.reset_cache()
     jax.config.update("jax_compilation_cache_dir", str(place))

@@ -1,8 +1,8 @@
 """The recursion over time: many runs in blocks of lanes, and its derivative by the adjoint.
 
 Arguments and results carry the runs on their first axis. Inside, a block of runs lies on the last axis
-and one scan takes it through time. The derivative goes back through the same steps, each linearised
-again from the belief it started from: nothing but beliefs is kept.
+and one scan takes it through time. The derivative goes back through the same steps, a few at a
+time: they are filtered again from the belief they started from, and only such beliefs are kept.
 """
 
 import math

@@ -148,7 +148,7 @@ def _is_sound(cov: Array) -> Array:
 def hide(
     measurement: Measurement, residual: Array, slope: Bands, noise: Array, mask: Array
 ) -> Linear:
-    """Hidden rows made inert: no slope and unit noise, whatever their numbers are."""
+    """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
     if many.are_many(residual):
         mask = mask.reshape(residual.shape)
         hidden = jax.vmap(partial(_hide, measurement))(residual, slope, noise, mask)
@@ -181,10 +181,9 @@ def take_block(
             return (gained, jnp.minimum(carry[1], pivot)), None
 
         return lax.scan(one, (gained, jnp.ones_like(gained.log_likelihood)), rows)[0]
-    if rows.noise.ndim == 3:
-        more = algebra.whitening_likelihood(rows)
-        gained = gained._replace(log_likelihood=gained.log_likelihood + more)
-    slope, rows = algebra.whitened(slope, rows)
+    slope, rows, determinant = algebra.whitened(slope, rows)
+    if determinant is not None:
+        gained = gained._replace(log_likelihood=gained.log_likelihood + determinant)
     if adjoint:
         return algebra.update_with_adjoint(slope)(gained, rows)
     return algebra.update(slope, gained, rows)
@@ -194,7 +193,7 @@ def take_keeping(slope: Pattern, gained: Gained, rows: algebra.Rows) -> tuple[Ga
     """A block of rows taken, and what the way back through it needs."""
     if many.are_many(rows.mask):
         return lax.scan(lambda gained, rows: take_keeping(slope, gained, rows), gained, rows)
-    slope, rows = algebra.whitened(slope, rows)
+    slope, rows, _ = algebra.whitened(slope, rows)
     gained, _, taken = algebra.take(slope, gained, rows)
     return gained, (rows, taken)
 

@@ -252,7 +252,8 @@ _MOVES: dict[str, Callable[[dict[str, Any], list[NDArray[Any]]], Any]] = {
 def _reduced(function: Callable[..., Any]) -> Callable[..., list[Known]]:
     def rule(params: dict[str, Any], operands: list[Known]) -> list[Known]:
         axes = tuple(params["axes"])
-        return [Known(function(operands[0].value, axis=axes), operands[0].known.all(axis=axes))]
+        known = np.asarray(operands[0].known.all(axis=axes))
+        return [Known(np.asarray(function(operands[0].value, axis=axes)), known)]
 
     return rule
 

@@ -4,7 +4,7 @@ All of it is found from the model's functions when a program is traced; a model 
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -212,18 +212,22 @@ def noise_of(function: Callable[..., Array], *spec: Any) -> tuple[Callable[..., 
     return (partial(linearise.variances, function) if diagonal else function), diagonal
 
 
-def pattern_of(jacobian: Callable[..., Jacobian], *spec: Any) -> Pattern:
-    """What is known of a Jacobian."""
-    dense = programs.trace(lambda *args: jacobian(*args).dense(), *spec)
-    return patterned.pattern(structure.find(dense))
+def patterns_of(jacobians: Callable[..., Sequence[Jacobian]], *spec: Any) -> list[Pattern]:
+    """The patterns of the Jacobians that a function makes."""
+    dense = programs.trace(lambda *args: [one.dense() for one in jacobians(*args)], *spec)
+    return [patterned.pattern(one) for one in structure.find(dense)]
+
+
+def both_jacobians(found: linearise.LinearTransition | linearise.LinearBetween) -> list[Jacobian]:
+    """F and G of a transition."""
+    return [found.f, found.g]
 
 
 def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
     dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
     linearised = partial(linearise.transition_blocks, model)
     spec = (params, x, u, dt)
-    state = pattern_of(lambda *args: linearised(*args).f, *spec)
-    noise = pattern_of(lambda *args: linearised(*args).g, *spec)
+    state, noise = patterns_of(lambda *args: both_jacobians(linearised(*args)), *spec)
     left: list[tuple[str, ...]] = []
 
     def step(*args: Any) -> Any:
@@ -252,7 +256,7 @@ def measurement(
     if sensor.alike is not None:
         rows = many.one_of(rows, sensor.copies)
     function = partial(linearised, model, one)
-    slope = pattern_of(lambda *args: function(*args).slope, params, x, u, rows)
+    (slope,) = patterns_of(lambda *args: [function(*args).slope], params, x, u, rows)
     noise, diagonal = noise_of(one.noise, params, rows.aux, rows.dt)
     left: list[tuple[str, ...]] = []
 

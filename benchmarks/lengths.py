@@ -13,14 +13,15 @@ from typing import Any
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from rich.progress import Progress  # noqa: E402
 
-import jaxekf  # noqa: E402
 import tuning  # noqa: E402
 from jaxekf import estimation, padding, simulate  # noqa: E402
 from tuning import descent  # noqa: E402

@@ -134,13 +134,13 @@ def _chain(size: int) -> tuple[Any, Any, Any]:
 def measure(point: Point) -> Point:
     """The point with its cost; to be called once in a process."""
     import jax
-
-    jax.config.update("jax_enable_x64", True)
     import jax.numpy as jnp
     import problem
     from clock import timed
 
-    from jaxekf import jit, run_filter_batch
+    from jaxekf import jit, run_filter_batch, set_up
+
+    set_up()
 
     if point.states == 10:
         model, given = problem.MODEL, problem.steps(problem.measurements(point.runs, point.steps))

@@ -19,8 +19,10 @@ from typing import Any
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import numpy as np  # noqa: E402
 
@@ -31,7 +33,6 @@ from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-import jaxekf  # noqa: E402
 import tuning  # noqa: E402
 from jaxekf import simulate  # noqa: E402
 from jaxekf.parameters import as_arrays  # noqa: E402

@@ -24,9 +24,11 @@ from typing import Any, NamedTuple
 
 import jax
 
+import jaxekf
+
 DEVICES = 2
 jax.config.update("jax_num_cpu_devices", DEVICES)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 jax.config.update("jax_enable_compilation_cache", False)
 
 import numpy as np  # noqa: E402
@@ -39,8 +41,6 @@ from models import KINDS, Measured  # noqa: E402
 from problem import NOISE, STEPS, Noise, measurements  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
-
-import jaxekf  # noqa: E402
 
 OURS = "jaxekf"
 """Compiled by `jaxekf.jit`, as `estimate` and `tune` are."""

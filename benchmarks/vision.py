@@ -17,7 +17,9 @@ if hasattr(os, "sched_setaffinity"):
 
 import jax
 
-jax.config.update("jax_enable_x64", True)
+import jaxekf
+
+jaxekf.set_up()
 
 import numpy as np  # noqa: E402
 from clock import timed  # noqa: E402

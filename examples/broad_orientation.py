@@ -32,8 +32,10 @@ os.environ.setdefault("JAXEKF_COMPILE", "quick")
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import numpy as np  # noqa: E402
 from recorded import parse, piece  # noqa: E402
@@ -41,7 +43,6 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-import jaxekf  # noqa: E402
 import tuning  # noqa: E402
 from jaxekf import optional, synchronise  # noqa: E402
 from jaxekf.datasets import broad  # noqa: E402

@@ -22,7 +22,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from recorded import parse, piece
 
@@ -110,7 +109,7 @@ def hold_out(
 
 def main() -> None:
     arguments = parse_arguments()
-    jax.config.update("jax_enable_x64", True)
+    jaxekf.set_up()
     began = time.perf_counter()
     training = load(arguments.folder, arguments.train, arguments.seed)
     testing = load(arguments.folder, arguments.test, arguments.seed)

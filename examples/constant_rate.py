@@ -17,7 +17,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 
 import jaxekf
@@ -106,7 +105,7 @@ def main() -> None:
         "-o", "--output", type=Path, help="folder for the figures of the first seed"
     )
     arguments = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+    jaxekf.set_up()
     models = MODELS[:1] if arguments.smoke else MODELS
     records = [run(seed) for seed in range(1 if arguments.smoke else arguments.seeds)]
     raw = np.mean([measurement_rmse(record) for record in records], axis=0)

@@ -21,8 +21,10 @@ from typing import Any, NamedTuple
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
@@ -30,7 +32,6 @@ from marker_bound import PRIOR, Bound, bound, density_factor, scaled  # noqa: E4
 from marker_figure import draw  # noqa: E402
 from rich.progress import Progress  # noqa: E402
 
-import jaxekf  # noqa: E402
 from jaxekf import ekf, estimation, metrics, online, parameters, pose, simulate_tool, timeline  # noqa: E402
 from jaxekf.models import tight  # noqa: E402
 from jaxekf.recording import Floats  # noqa: E402

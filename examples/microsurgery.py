@@ -279,7 +279,7 @@ def main() -> None:
         arguments.minutes = 0.5
     if arguments.minutes < 0.5:
         parser.error(f"got --minutes {arguments.minutes:g}, expected at least 0.5; make it longer")
-    jax.config.update("jax_enable_x64", True)
+    jaxekf.set_up()
     stages: dict[str, Callable[[], Any]] = {
         "with acceleration": lambda: run(arguments.seed, arguments.minutes),
         "without": lambda: run(arguments.seed, arguments.minutes, body_acceleration=False),

@@ -20,15 +20,16 @@ from typing import Any, NamedTuple
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import numpy as np  # noqa: E402
 from recorded import parse, piece  # noqa: E402
 from rich.progress import Progress  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-import jaxekf  # noqa: E402
 from jaxekf import synchronise  # noqa: E402
 from jaxekf.datasets import asl  # noqa: E402
 from jaxekf.models import loose_pose  # noqa: E402

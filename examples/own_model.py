@@ -126,7 +126,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="the same: it takes seconds")
     parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
+    jaxekf.set_up()
     run = jaxekf.load(demo.FOLDER / "free-5")
     estimate = jaxekf.estimate(run, MODEL)
     scale = estimate.part("scale")

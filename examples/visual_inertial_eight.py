@@ -21,8 +21,10 @@ from typing import Any, NamedTuple
 
 import jax
 
+import jaxekf
+
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 
 import numpy as np  # noqa: E402
 from matplotlib.patches import Ellipse  # noqa: E402
@@ -31,7 +33,6 @@ from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-import jaxekf  # noqa: E402
 from jaxekf import regions, resection  # noqa: E402
 from jaxekf.model import Belief  # noqa: E402
 from jaxekf.plots import style  # noqa: E402

@@ -1,6 +1,6 @@
 """Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
 
-JAX must be set to float64: ``jax.config.update("jax_enable_x64", True)``.
+Begin with ``jaxekf.set_up()``: JAX must be set to float64, and compiles less for faster programs.
 """
 
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jaxekf.gaps import split_at_gaps
     from jaxekf.interpolation import InputSample
     from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
-    from jaxekf.kernels import jit
+    from jaxekf.kernels import jit, set_up
     from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
     from jaxekf.metrics import Score, score
     from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor, Start
@@ -120,6 +120,7 @@ __all__ = [
     "save",
     "save_parameters",
     "score",
+    "set_up",
     "split_at_gaps",
     "timeline",
     "unscented",
@@ -148,7 +149,7 @@ _PLACES = {
     "jaxekf.gaps": ("split_at_gaps",),
     "jaxekf.interpolation": ("InputSample",),
     "jaxekf.iterated": ("IteratedOutput", "run_iterated_smoother", "run_iterated_smoother_batch"),
-    "jaxekf.kernels": ("jit",),
+    "jaxekf.kernels": ("jit", "set_up"),
     "jaxekf.manifold": ("SO3", "AdditiveQuaternion", "Euclidean", "Manifold"),
     "jaxekf.metrics": ("Score", "score"),
     "jaxekf.model": ("Belief", "Input", "Model", "Output", "Parameters", "Sensor", "Start"),

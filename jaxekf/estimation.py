@@ -33,8 +33,8 @@ def require_float64() -> None:
     """Raise `PrecisionError` where JAX is not set to float64."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise PrecisionError(
-            "got JAX in float32, expected float64; call jax.config.update('jax_enable_x64', True)"
-            " before the first array, or set JAX_ENABLE_X64=1"
+            "got JAX in float32, expected float64; call jaxekf.set_up() before the first array, or set"
+            " JAX_ENABLE_X64=1"
         )
 
 

@@ -20,6 +20,7 @@ from jaxekf import linalg
 from jaxekf.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
 from jaxekf.model import Belief
 from jaxekf.own_derivative import merge, unfilled
+from jaxekf.packed import Packed, packed
 from jaxekf.step import Moment, Outcome, Track, begin, predict, update
 from jaxekf.system import System
 
@@ -146,18 +147,23 @@ def _scan(
     given: Given,
 ) -> tuple[Kept, Track | None]:
     """All epochs; also, where `segment` is given, the track at the start of every `segment` epochs."""
-    epoch = partial(_epoch, system, what, adjoint, prepared)
     track = begin(system, *first)
-    if segment is None:
-        return lax.scan(epoch, track, given)[1], None
 
-    def stretch(track: Track, given: Given) -> tuple[Track, tuple[Kept, Track]]:
+    def epoch(track: Track, given: Packed) -> tuple[Track, Packed]:
+        after, kept = _epoch(system, what, adjoint, prepared, track, given.opened())
+        return after, packed(kept)
+
+    if segment is None:
+        return lax.scan(epoch, track, packed(given, 1))[1].opened(), None
+
+    def stretch(track: Track, given: Packed) -> tuple[Track, tuple[Packed, Track]]:
         after, kept = lax.scan(epoch, track, given)
         return after, (kept, track)
 
     epochs = given.moments.dt.shape[0]
-    kept, starts = lax.scan(stretch, track, _cut(_filled(given, segment), segment))[1]
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], kept), starts
+    pieces = _cut(packed(_filled(given, segment), 1), segment)
+    kept, starts = lax.scan(stretch, track, pieces)[1]
+    return _joined(kept, epochs).opened(), starts
 
 
 def _filled(given: Given, segment: int) -> Given:
@@ -190,6 +196,11 @@ def _cut(tree: Any, segment: int) -> Any:
         return a.reshape(-1, segment, *a.shape[1:])
 
     return jax.tree.map(cut, tree)
+
+
+def _joined(tree: Any, epochs: int) -> Any:
+    """The inverse of `_cut`, for so many epochs."""
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], tree)
 
 
 @dataclass(frozen=True)
@@ -227,9 +238,11 @@ def _scan_back(
     pulls = _Pulls()
 
     def stretch(carry: Any, at: Any) -> Any:
-        start, leaves, cotangents = at
+        start, given, cotangents = at
 
-        def step(track: Track, leaves: list[Array]) -> tuple[Track, list[Array]]:
+        def step(track: Track, given: Packed) -> tuple[Track, Packed]:
+            leaves = given.opened()
+
             def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
                 full = jax.tree.unflatten(tree, merge(moving, moved, leaves))
                 own = jax.tree.unflatten(prepared_tree, merge(free, floats, values))
@@ -239,24 +252,23 @@ def _scan_back(
 
             moved = [v for f, v in zip(moving, leaves, strict=True) if f]
             (track, _), pull = jax.vjp(forward, floats, track, moved)
-            return track, pulls.opened(pull, values, leaves)
+            return track, packed(pulls.opened(pull, values, leaves))
 
         def back(carry: Any, at: Any) -> Any:
             after, total = carry
-            saved, leaves, cotangents = at
+            saved, leaves, cotangents = (one.opened() for one in at)
             pull = pulls.closed(saved, values, leaves)
             gained, before, of_given = pull((after, cotangents))
-            return (before, jax.tree.map(jnp.add, total, gained)), of_given
+            return (before, jax.tree.map(jnp.add, total, gained)), packed(of_given)
 
-        _, saved = lax.scan(step, start, leaves)
-        return lax.scan(back, carry, (saved, leaves, cotangents), reverse=True)
+        _, saved = lax.scan(step, start, given)
+        return lax.scan(back, carry, (saved, given, cotangents), reverse=True)
 
     zero = jax.tree.map(lambda a: jnp.zeros(a.shape[1:], a.dtype), starts)
     carry = (zero, jax.tree.map(jnp.zeros_like, floats))
-    pieces = (starts, _cut(every, segment), _cut(cotangents, segment))
+    pieces = (starts, _cut(packed(every, 1), segment), _cut(packed(cotangents, 1), segment))
     (first, total), of_given = lax.scan(stretch, carry, pieces, reverse=True)
-    of_given = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], of_given)
-    return total, first.belief, of_given
+    return total, first.belief, _joined(of_given, epochs).opened()
 
 
 class _Pulls:

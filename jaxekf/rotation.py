@@ -7,7 +7,9 @@ silently; gradients, also second ones, are finite everywhere, the zero rotation 
 """
 
 import functools
+import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -41,18 +43,51 @@ def _group(function: _F) -> _F:
 
 _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).swapaxes(1, 2)
 
+# pi in two parts, the first with few enough digits that a million times it is exact.
+_PI = 3.141592651605606
+_PI_REST = 1.984187159361081e-09
+# Of cos(x) and sin(x) / (2 x) in powers of x * x; up to pi / 2 what is left out is below rounding.
+_COSINE_AND_SINE = tuple(
+    ((-1.0) ** k / math.factorial(2 * k), 0.5 * (-1.0) ** k / math.factorial(2 * k + 1))
+    for k in range(11)
+)
+
 # Below these squared sizes the series are exact to rounding, value and two derivatives, so that the
 # closed forms (which divide by the size) are never evaluated where they are 0/0.
 _SMALL_ANGLE_SQUARED = 1e-2
 _SMALL_TANGENT_SQUARED = 1e-3
 
 
-def _polynomial(x: Array, coefficients: tuple[float, ...]) -> Array:
-    """Horner evaluation of ``sum(c[i] * x**i)``."""
-    value = jnp.full_like(x, coefficients[-1])
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _polynomial(x: Array, coefficients: tuple[Any, ...]) -> Array:
+    """Horner evaluation of ``sum(c[i] * x**i)``; of several, with as many numbers in each ``c[i]``, on the
+    last axis, where `x` has one number."""
+
+    def numbers(coefficient: Any) -> Array:
+        value = jnp.asarray(coefficient, x.dtype)
+        return value.reshape((1,) * (x.ndim - value.ndim) + value.shape) if value.ndim else value
+
+    value = numbers(coefficients[-1])
+    x = jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, value.shape))
     for coefficient in reversed(coefficients[:-1]):
-        value = value * x + coefficient
+        value = value * x + numbers(coefficient)
     return value
+
+
+@_polynomial.defjvp
+def _polynomial_jvp(
+    coefficients: tuple[Any, ...], primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[Array, Array]:
+    # A polynomial itself: a third of the operations of the derivative of Horner's way.
+    (x,), (moved,) = primals, tangents
+    derived = tuple(_times(k, c) for k, c in enumerate(coefficients))[1:]
+    return _polynomial(x, coefficients), _polynomial(x, derived or (0.0,)) * moved
+
+
+def _times(factor: int, coefficient: Any) -> Any:
+    if isinstance(coefficient, tuple):
+        return tuple(factor * c for c in coefficient)
+    return factor * coefficient
 
 
 def identity() -> Array:
@@ -114,16 +149,24 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
 
 
 def _half_angle(delta: Array) -> tuple[Array, Array]:
-    """``cos(a / 2)`` and ``sin(a / 2) / a`` for ``a = |delta|``, shape (...)."""
-    squared = jnp.sum(delta * delta, axis=-1)
-    small = squared < _SMALL_ANGLE_SQUARED
-    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
-    series = jnp.where(small, squared, 0.0)
-    cosine = _polynomial(series, (1.0, -1 / 8, 1 / 384, -1 / 46080, 1 / 10321920))
-    sine = _polynomial(series, (1 / 2, -1 / 48, 1 / 3840, -1 / 645120, 1 / 185794560))
+    """``cos(a / 2)`` and ``sin(a / 2) / a`` for ``a = |delta|``, shape (...).
+
+    Up to half a turn both are series in the square, which is smooth at zero too; beyond, whole turns are
+    taken off first. Many of these run side by side, where a processor has no sine of its own and the
+    mathematical library takes one at a time.
+    """
+    square = 0.25 * jnp.sum(delta * delta, axis=-1)
+    within = square < (0.5 * np.pi) ** 2
+    half = jnp.sqrt(jnp.where(within, 1.0, square))
+    turns = jnp.round(half * (1.0 / np.pi))
+    rest = (half - turns * _PI) - turns * _PI_REST
+    series = jnp.where(within, square, rest * rest)
+    both = _polynomial(series[..., None], _COSINE_AND_SINE)
+    cosine, sine = both[..., 0], both[..., 1]
+    sign = 1.0 - 2.0 * (turns - 2.0 * jnp.floor(0.5 * turns))
     return (
-        jnp.where(small, cosine, jnp.cos(0.5 * angle)),
-        jnp.where(small, sine, jnp.sin(0.5 * angle) * _reciprocal(angle)),
+        jnp.where(within, cosine, sign * cosine),
+        jnp.where(within, sine, sign * rest * sine * _reciprocal(half)),
     )
 
 

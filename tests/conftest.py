@@ -1,9 +1,11 @@
 """Settings and fixtures shared by all tests."""
 
 import atexit
+import ctypes
 import functools
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import jax
 import pytest
 from hypothesis import settings
 
+import jaxekf
 from jaxekf.result import Estimate
 
 # Nearly all tests wait for the compiler, not for what it made. Those of the filter itself, and the long
@@ -18,7 +21,7 @@ from jaxekf.result import Estimate
 if os.environ.get("JAXEKF_LONG") != "1":
     os.environ.setdefault("JAXEKF_COMPILE", "quick")
 
-jax.config.update("jax_enable_x64", True)
+jaxekf.set_up()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Nearly all the time goes into compiling. Programs are kept for this run of the tests, so that what two
@@ -38,9 +41,12 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 @pytest.fixture(scope="module", autouse=True)
 def _forget_compiled_programs():
     """Drop the programs of each file at its end: every one holds memory maps, of which a process may
-    have only so many, and the compiler crashes when they run out."""
+    have only so many, and the compiler crashes when they run out. What the compiler freed goes back to
+    the system, which takes half of a process's memory."""
     yield
     jax.clear_caches()
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session", autouse=True)

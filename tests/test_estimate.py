@@ -169,7 +169,7 @@ def test_rate_covariance_holds_for_the_rate(tmp_path):
 
 def test_float32_is_refused_in_a_sentence():
     """Would catch variances that are wrong by tens of percent without a word."""
-    with jax.enable_x64(False), pytest.raises(PrecisionError, match="jax_enable_x64"):
+    with jax.enable_x64(False), pytest.raises(PrecisionError, match="set_up"):
         jaxekf.estimate(record())
 
 

@@ -39,9 +39,8 @@ def main() -> None:
     or with camera.csv and landmarks.csv.
     """
     # JAX costs most of a second: not for the help and the version, which end before this.
-    import jax
-
     from jaxekf.cli.machine import prepare
+    from jaxekf.kernels import set_up
 
-    jax.config.update("jax_enable_x64", True)
+    set_up()
     prepare()

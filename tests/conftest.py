@@ -35,6 +35,26 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 settings.register_profile("jaxekf", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("jaxekf")
 
+LONGEST = {
+    f"test_{name}.py"
+    for name in (
+        *("calibration", "contract", "gradient", "naive", "scripts", "smoother", "speed", "tight"),
+        *("tuning", "tuning_statistics"),
+    )
+}
+"""Files that take minutes. They are begun first, so that neither process waits for the other at the end."""
+
+
+def pytest_configure(config):
+    # Or pytest-xdist begins with the files of most tests.
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 

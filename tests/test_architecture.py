@@ -46,7 +46,7 @@ ORDER = [
     ("inspection",),
     ("interpolation", "padding", "programs", "kernels", "reverse_only"),
     ("structure", "lanes", "blocks", "epochs", "many"),
-    ("patterned", "group_derivative", "own_derivative"),
+    ("patterned", "packed", "group_derivative", "own_derivative"),
     ("linearise", "algebra"),
     ("system",),
     ("outliers", "about"),

@@ -159,14 +159,18 @@ def test_many_runs_are_single_runs():
         found = smoother.run_smoother(model, model.parameters, b, steps)
         return jnp.sum(jnp.sin(found.smoothed.mean)) + jnp.sum(found.start.cov)
 
-    slopes = jax.vmap(jax.grad(slope))(moved)
+    slopes = scenario.quick_jit(jax.vmap(jax.grad(slope)))(moved)
+    single_slope = scenario.quick_jit(jax.grad(slope))
+    single_run = scenario.quick_jit(
+        lambda b: smoother.run_smoother(model, model.parameters, b, steps)
+    )
     for i in range(3):
         one = jax.tree.map(lambda a, i=i: a[i], moved)
-        alone = smoother.run_smoother(model, model.parameters, one, steps)
+        alone = single_run(one)
         for found in (batch, mapped):
             np.testing.assert_allclose(found.smoothed.mean[i], alone.smoothed.mean, atol=1e-12)
             np.testing.assert_allclose(found.smoothed.cov[i], alone.smoothed.cov, atol=1e-12)
-        single = jax.grad(slope)(one)
+        single = single_slope(one)
         np.testing.assert_allclose(slopes.mean[i], single.mean, atol=1e-11)
 
 

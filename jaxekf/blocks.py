@@ -15,8 +15,9 @@ from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
 LANES = 8 if jax.__version_info__ >= (0, 11) else 16
-"""Runs in a block. Eight numbers fill a vector register of AVX-512, and with more of them the covariances of 15
-states leave the first cache; before 0.11 JAX calls a function for each stage, which more runs have to pay for."""
+"""Runs in a block. Eight numbers fill a vector register of AVX-512, and with more of them the covariances
+of 15 states leave the first cache; before 0.11 JAX calls a function for each stage, which more runs have to
+pay for."""
 
 
 class Blocks(NamedTuple):

@@ -130,6 +130,18 @@ def test_both_branches_agree_with_independent_forms(size):
     np.testing.assert_allclose(right_jacobian(v), left_series(v), rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("size", [np.pi - 1e-9, np.pi + 1e-9, 5.0, 6.3, 9.4, 9.5, 1e3, 1e5])
+def test_exp_beyond_half_a_turn(size):
+    """A whole turn that is not taken off, or taken off with the wrong sign; a slope lost on the way."""
+    v = size * np.array([0.6, -0.48, 0.64])
+    rounding = 1e-15 + 2e-16 * size
+    np.testing.assert_allclose(exp(v), sinc_form(v), rtol=0, atol=rounding)
+    slope, step = jax.jacrev(rotation.exp)(jnp.asarray(v)), 1e-5
+    for axis, way in enumerate(np.eye(3)):
+        numeric = (sinc_form(v + step * way) - sinc_form(v - step * way)) / (2.0 * step)
+        np.testing.assert_allclose(slope[:, axis], numeric, rtol=0, atol=1e-9 + rounding / step)
+
+
 @given(rotation_vectors(2.5))
 def test_right_jacobian(v):
     """A left Jacobian, or a transposed one."""

@@ -30,7 +30,7 @@ FREE = [
 ]
 
 
-def planted(seed, duration_s=30.0 if LONG else 12.0):
+def planted(seed, duration_s=30.0):
     """A run whose gyroscope lags and is scaled and skewed."""
     run = simulate.recording(
         f"run-{seed}",

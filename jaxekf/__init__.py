@@ -1,6 +1,6 @@
 """Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
 
-Begin with ``jaxekf.set_up()``: JAX must be set to float64, and compiles less for faster programs.
+Begin with ``jaxekf.set_up()``: it sets JAX to float64 and its compiler to what suits the filter.
 """
 
 from typing import TYPE_CHECKING

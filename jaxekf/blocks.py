@@ -14,10 +14,12 @@ import numpy as np
 from jax import Array, lax
 from jax.custom_batching import custom_vmap
 
-LANES = 8 if jax.__version_info__ >= (0, 11) else 16
+from jaxekf.kernels import KEEPS_BARRIERS
+
+LANES = 8 if KEEPS_BARRIERS else 16
 """Runs in a block. Eight numbers fill a vector register of AVX-512, and with more of them the covariances
-of 15 states leave the first cache; before 0.11 JAX calls a function for each stage, which more runs have to
-pay for."""
+of 15 states leave the first cache. Where barriers are not kept each stage is the call of a function, whose
+cost more runs share."""
 
 
 class Blocks(NamedTuple):

@@ -331,10 +331,7 @@ def _columns(
 
 def _fitted(columns: Any, operation: Operation, count: int) -> Any:
     """Columns of a scalar or one wide operand in the shape of the result."""
-    shape = (*operation.shapes[0].shape, count)
-    return (
-        columns if columns.shape == shape else lanes.along(columns, shape, *range(columns.ndim - 1))
-    )
+    return lanes.fitted(columns, (*operation.shapes[0].shape, count))
 
 
 def _is_elementwise(operation: Operation) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from jaxekf.kernels import KEEPS_BARRIERS
 from jaxekf.programs import Constant, Operation, Program, opened
 
 _COSTLY = {"div": 6.0, "rsqrt": 6.0, "sqrt": 6.0} | dict.fromkeys(
@@ -64,9 +65,9 @@ def stage(tree: Any) -> Any:
 
 
 def _kept(array: Array) -> Array:
-    if jax.__version_info__ >= (0, 11):
+    if KEEPS_BARRIERS:
         return lax.optimization_barrier(array)
-    # Before, XLA on a CPU took barriers away before it fused; a call that is not inlined stays.
+    # A call that is not inlined stays.
     with set_xla_metadata(inlineable="false", xla_cpu_small_call="false"):
         return jax.jit(lax.optimization_barrier)(array)
 
@@ -171,7 +172,12 @@ def _to_shape(operand: Any, shape: tuple[int, ...]) -> Any:
     if isinstance(operand, Fixed):
         value = operand.value
         return lax.broadcast_in_dim(jnp.asarray(value), shape, tuple(range(np.ndim(value))))
-    return operand if operand.shape == shape else along(operand, shape, *range(operand.ndim - 1))
+    return fitted(operand, shape)
+
+
+def fitted(array: Array, shape: tuple[int, ...]) -> Array:
+    """A scalar with lanes, or an array that is one wide where `shape` is not, in that shape."""
+    return array if array.shape == shape else along(array, shape, *range(array.ndim - 1))
 
 
 def _whole(operation: Operation, operands: list[Any]) -> list[Any]:

@@ -53,15 +53,11 @@ def packed(tree: Any, axes: int = 0) -> Packed:
     """The arrays of `tree` together, whose first `axes` axes are the same."""
     leaves, structure = jax.tree.flatten(tree)
     parts: dict[Any, list[Array]] = {}
-    filled: dict[Any, int] = {}
     places, shapes = [], []
     for leaf in leaves:
-        dtype = leaf.dtype
-        which = list(parts).index(dtype) if dtype in parts else len(parts)
-        flat = leaf.reshape(*leaf.shape[:axes], -1)
-        places.append((which, filled.get(dtype, 0)))
+        before = parts.setdefault(leaf.dtype, [])
+        places.append((list(parts).index(leaf.dtype), sum(p.shape[-1] for p in before)))
         shapes.append(leaf.shape[axes:])
-        parts.setdefault(dtype, []).append(flat)
-        filled[dtype] = filled.get(dtype, 0) + flat.shape[-1]
+        before.append(leaf.reshape(*leaf.shape[:axes], -1))
     arrays = [p[0] if len(p) == 1 else jnp.concatenate(p, axis=-1) for p in parts.values()]
     return Packed(arrays, _Layout(structure, tuple(places), tuple(shapes)))

@@ -199,7 +199,7 @@ def _cut(tree: Any, segment: int) -> Any:
 
 
 def _joined(tree: Any, epochs: int) -> Any:
-    """The inverse of `_cut`, for so many epochs."""
+    """The segments of `_cut` as (epochs, ...) again, without what filled the last one."""
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], tree)
 
 

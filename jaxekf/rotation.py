@@ -9,7 +9,6 @@ silently; gradients, also second ones, are finite everywhere, the zero rotation 
 import functools
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -46,7 +45,8 @@ _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).swapaxes(1, 2)
 # pi in two parts, the first with few enough digits that a million times it is exact.
 _PI = 3.141592651605606
 _PI_REST = 1.984187159361081e-09
-# Of cos(x) and sin(x) / (2 x) in powers of x * x; up to pi / 2 what is left out is below rounding.
+# Taylor coefficients of cos(x) and sin(x) / (2 x) in powers of x * x. For x up to pi / 2 the error of
+# truncation is below rounding.
 _COSINE_AND_SINE = tuple(
     ((-1.0) ** k / math.factorial(2 * k), 0.5 * (-1.0) ** k / math.factorial(2 * k + 1))
     for k in range(11)
@@ -58,7 +58,7 @@ _SMALL_ANGLE_SQUARED = 1e-2
 _SMALL_TANGENT_SQUARED = 1e-3
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _polynomial(x: Array, coefficients: tuple[Any, ...]) -> Array:
     """Horner evaluation of ``sum(c[i] * x**i)``; of several, with as many numbers in each ``c[i]``, on the
     last axis, where `x` has one number."""

@@ -1,10 +1,11 @@
 """The covariance algebra of the filter on lanes, each piece with its derivative in closed form.
 
-Covariances are symmetric but for rounding, and so are their cotangents. Rows of a measurement are taken one
-after the other: each is a division, and no matrix is factored. The derivatives are those of Parellier,
-Barrau and Bonnabel (2023), row by row, extended to the log-likelihood and to the slope of the measurement.
+Covariances are symmetric but for rounding, and so are their cotangents. Rows of a measurement are taken a
+few at a time. The derivatives are those of Parellier, Barrau and Bonnabel (2023), block by block, extended
+to the log-likelihood and to the slope of the measurement.
 """
 
+import itertools
 import operator
 from functools import cache, reduce
 from typing import Any, NamedTuple
@@ -16,9 +17,11 @@ from jax import Array
 
 from jaxekf import linalg, patterned
 from jaxekf.lanes import along, folded_sum, stage, written_sum
-from jaxekf.patterned import Bands, Pattern, Row
+from jaxekf.patterned import Bands, Pattern
 
-_VARIANCES_PER_LOG = 4
+_ROWS_TOGETHER = 3
+"""Rows of a measurement taken at once: a third of the loops of one by one, and their inverse is still
+written out."""
 _LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -32,6 +35,12 @@ def product_transposed(left: Array, right: Array) -> Array:
     """``left @ right.T``, (i, k, lanes), (j, k, lanes) to (i, j, lanes)."""
     shape = (left.shape[0], *right.shape)
     return folded_sum(along(left, shape, 0, 2) * along(right, shape, 1, 2), 2)
+
+
+def transposed_product(left: Array, right: Array) -> Array:
+    """``left.T @ right``, (k, i, lanes), (k, j, lanes) to (i, j, lanes)."""
+    shape = (*left.shape[:2], *right.shape[1:])
+    return folded_sum(along(left, shape, 0, 1) * along(right, shape, 0, 2), 0)
 
 
 def apply(matrix: Array, vector: Array) -> Array:
@@ -90,7 +99,8 @@ def _congruence_pullback(
 
     def slope(rows: tuple[int, ...], cols: tuple[int, ...]) -> Array:
         above = patterned.take(cotangent, rows, 0)
-        return stage(2.0 * product(above, patterned.take(half, cols, 1)))
+        parts = [stage(2.0 * product(above, part)) for part in patterned.parts(half, cols, 1)]
+        return parts[0] if len(parts) == 1 else stage(jnp.concatenate(parts, 1))
 
     return tuple(slope(*band) for band in p.bands), stage(cov)
 
@@ -188,14 +198,50 @@ class Gained(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """A row that was taken, for whoever goes back through it; (1, lanes) but for the gain."""
+    """A block of rows that was taken, for whoever goes back through it; 0 where a row does not count."""
 
     gain: Array
-    """(n, lanes)."""
+    """``S^-1 H P``, (m, n, lanes)."""
     inverse: Array
-    """One over the innovation's variance."""
+    """Inverse of the innovation's covariance S, (m, m, lanes)."""
     scaled: Array
-    """The innovation times that; 0 where the row does not count."""
+    """``S^-1`` times the innovation, (m, lanes)."""
+
+
+class Block(NamedTuple):
+    """Rows H that are taken together."""
+
+    start: int
+    stop: int
+    pattern: Pattern
+    bands: Bands
+    seen: Array
+    """(m, lanes) rows that count."""
+
+    def times(self, x: Array, axis: int = 0) -> Array:
+        """``H x``; with ``axis=1`` ``x H'``."""
+        return patterned.multiply(self.pattern, self.bands, x, axis)
+
+    def back(self, x: Array, axis: int = 0) -> Array:
+        """``H' x``; with ``axis=1`` ``x H``."""
+        turned = patterned.transpose(self.bands)
+        return patterned.multiply(self.pattern.transposed, turned, x, axis)
+
+    def shown(self, x: Array) -> Array:
+        """`x`, (m, ..., lanes), with 0 in rows that do not count."""
+        seen = self.seen if x.ndim == 2 else self.seen[:, None]
+        return jnp.where(seen, x, 0.0)
+
+
+def blocks(p: Pattern, rows: Rows) -> list[Block]:
+    """The rows in blocks of much the same size."""
+    size = rows.mask.shape[0]
+    count = -(-size // _ROWS_TOGETHER)
+    found = []
+    for start, stop in itertools.pairwise(size * k // count for k in range(count + 1)):
+        part = patterned.rows_of(p, rows.slope, start, stop)
+        found.append(Block(start, stop, *part, rows.mask[start:stop]))
+    return found
 
 
 def innovation_covariance(p: Pattern, bands: Bands, noise: Array, cov: Array) -> Array:
@@ -226,62 +272,89 @@ def pattern_taken(p: Pattern, rows: Rows) -> Pattern:
     return p if rows.noise.ndim == rows.mask.ndim else patterned.whole(p)
 
 
-def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Taken]]:
-    """The state after rows of diagonal noise, the smallest variance of an innovation, and each row taken.
+def _inverse(matrix: Array) -> tuple[Array, list[Array]]:
+    """Inverse (m, m, lanes) of a small positive definite matrix, of which the lower half is read, and the
+    pivots of its factors ``L D L'``, (1, lanes) each: not positive where it is not definite."""
+    size, lanes = matrix.shape[1:]
+    pivots: list[Array] = []
+    inverses: list[Array] = []
+    factor: list[list[Array]] = []
+    units: list[Array] = []
+    """Rows of the inverse of L."""
+    for i in range(size):
+        scaled: list[Array] = []
+        for j in range(i):
+            known = [c * s for c, s in zip(factor[j], scaled, strict=True)]
+            scaled.append(written_sum([matrix[i, j : j + 1], *(-k for k in known)]))
+        row = [s * inverse for s, inverse in zip(scaled, inverses, strict=True)]
+        gone = [-(c * s) for c, s in zip(row, scaled, strict=True)]
+        pivots.append(written_sum([matrix[i, i : i + 1], *gone]))
+        inverses.append(stage(1.0 / pivots[i]))
+        unit = jnp.broadcast_to(np.eye(size)[i][:, None], (size, lanes))
+        if i:
+            unit = stage(unit - written_sum([c * u for c, u in zip(row, units, strict=True)]))
+        factor.append(row)
+        units.append(unit)
+    return written_sum([outer(u, u * v) for u, v in zip(units, inverses, strict=True)]), pivots
 
-    A row h of variance r with ``S = h' P h + r`` and gain ``k = P h / S`` makes Joseph's
-    ``(I - k h') P (I - k h')' + k r k'``, in the order ``P - k (P h)' + (k r - (P - k (P h)') h) k'``: a
-    gain that is rounded then counts only to the second order. The covariance stays symmetric but for
-    rounding.
+
+def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Taken], list[Array]]:
+    """The state after rows of diagonal noise, the smallest pivot of the innovations' covariances, the
+    blocks of rows taken, and ``H P`` of each.
+
+    Rows H with noise R make ``S = H P H' + R``, the gain ``K = P H' S^-1`` and Joseph's
+    ``(I - K H) P (I - K H)' + K R K'``, in the order ``P - K H P + (K R - (P - K H P) H') K'``: a gain that
+    is rounded then counts only to the second order. The covariance stays symmetric but for rounding.
     """
     cov, delta, log_likelihood = gained
-    taken, variances, squares = [], [], []
-    for i in range(rows.mask.shape[0]):
-        row, seen = Row(p, rows.slope, i), rows.mask[i : i + 1]
-        noise, residual = rows.noise[i : i + 1], rows.residual[i : i + 1]
-        ph = stage(jnp.where(seen, row.times(cov), 0.0))
-        variance = stage(jnp.where(seen, row.dot(ph) + noise, 1.0))
-        inverse = stage(1.0 / variance)
-        residual = jnp.where(seen, residual - row.dot(delta), 0.0)
-        scaled = stage(residual * inverse)
-        gain = stage(ph * inverse)
-        half = cov - outer(gain, ph)
-        rest = stage(jnp.where(seen, gain * noise - row.times(half), 0.0))
-        cov = stage(half + outer(rest, gain))
-        delta = stage(delta + ph * scaled)
+    taken, crosses, smallest, terms = [], [], [], []
+    for block in blocks(p, rows):
+        seen, noise = block.seen, rows.noise[block.start : block.stop]
+        both = seen[:, None] & seen[None]
+        cross = stage(block.shown(block.times(cov)))
+        spread = block.times(cross, 1) + on_diagonal(noise)
+        found, pivots = _inverse(stage(jnp.where(both, spread, on_diagonal(jnp.ones_like(noise)))))
+        inverse = stage(jnp.where(both, found, 0.0))
+        gain = stage(product(inverse, cross))
+        residual = rows.residual[block.start : block.stop] - block.times(delta)
+        residual = stage(block.shown(residual))
+        scaled = stage(apply(inverse, residual))
+        half = stage(cov - transposed_product(gain, cross))
+        rest = stage(block.shown(gain * along(noise, gain.shape, 0) - block.times(half)))
+        cov = stage(half + transposed_product(rest, gain))
+        delta = stage(delta + folded_sum(along(scaled, cross.shape, 0) * cross, 0))
         taken.append(Taken(gain, inverse, scaled))
-        variances.append(variance)
-        squares.append(residual * scaled)
-    # Few logarithms: variances are multiplied first, few enough that no product over- or underflows.
-    products = [
-        reduce(operator.mul, variances[i : i + _VARIANCES_PER_LOG])
-        for i in range(0, len(variances), _VARIANCES_PER_LOG)
-    ]
+        crosses.append(cross)
+        smallest.append(reduce(jnp.minimum, pivots))
+        # One logarithm: the product of so few variances neither over- nor underflows.
+        terms += [dot(residual, scaled), jnp.log(reduce(operator.mul, pivots))]
     visible = folded_sum(rows.mask.astype(cov.dtype), 0, keep=True)
-    surprise = written_sum([*squares, *map(jnp.log, products), visible * _LOG_2PI])
+    surprise = written_sum([*terms, visible * _LOG_2PI])
     log_likelihood = stage(log_likelihood - 0.5 * surprise[0])
-    return Gained(cov, delta, log_likelihood), reduce(jnp.minimum, variances)[0], taken
+    after = Gained(cov, delta, log_likelihood)
+    return after, reduce(jnp.minimum, smallest)[0], taken, crosses
 
 
 def update(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array]:
-    """The state after rows of diagonal noise, and the smallest variance of an innovation."""
-    after, smallest, _ = take(p, gained, rows)
-    return after, smallest
+    """The state after rows of diagonal noise, and the smallest pivot of the innovations' covariances."""
+    return take(p, gained, rows)[:2]
 
 
 def back_through(
-    row: Array, seen: Array, gain: Array, matrix: Array, inner: Array, side: Array | None
+    block: Block, gain: Array, matrix: Array, inner: Array, side: Array | None
 ) -> tuple[Array, Array]:
-    """``A' B A + c h h' + (h t' + t h') / 2`` with ``A = I - k h'``, and ``B k``.
+    """``A' B A + H' N H + (H' t + t' H) / 2`` with ``A = I - K H``, and ``K' B``.
 
-    For the whole row h, a matrix B, ``c = inner``, (1, lanes), and a vector ``t = side``; None for 0.
+    For the block of rows H, symmetric matrices B and ``N = inner``, (m, m, lanes), and ``t = side``,
+    (m, n, lanes); None for 0.
     """
-    image = stage(apply(matrix, gain))
-    arm = 0.5 * (dot(gain, image) + inner) * row - image
+    image = stage(product(gain, matrix))
+    weight = stage(0.5 * (product_transposed(image, gain) + inner))
+    arm = block.back(weight, 1) - image
     if side is not None:
         arm = arm + 0.5 * side
-    arm = stage(jnp.where(seen, arm, 0.0))
-    return stage(matrix + outer(row, arm) + outer(arm, row)), image
+    arms = stage(block.back(stage(block.shown(arm))))
+    return stage(matrix + (arms + arms.swapaxes(0, 1))), image
 
 
 class _Saved(NamedTuple):
@@ -292,56 +365,55 @@ class _Saved(NamedTuple):
     delta: Array
     """After it."""
     taken: list[Taken]
+    crosses: list[Array]
+    """``H P`` of all blocks but the first, to find P before them; none where H is known."""
     rows: Rows
 
 
 def _update_pullback(p: Pattern, saved: _Saved, cotangent: Gained) -> tuple[Gained, Rows]:
     """Cotangents of what went into `update` from those of what came out.
 
-    Row by row, the last first, with ``a``, B and w the cotangents of delta, P and log-likelihood after the
-    row: ``c = k' a - w s`` is the residual's, ``k' B k - s k' a + w (s^2 - 1 / S) / 2`` the noise's and
-    ``s P a - c delta - 2 P B k - w k`` the slope's.
+    Block by block, the last first, with ``a``, B and w the cotangents of delta, P and log-likelihood after
+    the block, ``d = K' a`` and ``N = w (s s' - S^-1) / 2``: ``c = d - w s`` is the residual's, the diagonal
+    of ``K' B K - s d' + N`` the noise's and ``(s a' - 2 K' B) P - c delta' - w K'`` the slope's.
     """
     b, a, weight = cotangent.cov, cotangent.delta, cotangent.log_likelihood[None]
     delta, cov, rows = saved.delta, saved.cov, saved.rows
     residuals: list[Array] = []
     noises: list[Array] = []
-    slopes: list[list[Array]] = []
-    for i in reversed(range(rows.mask.shape[0])):
-        row, seen, (gain, inverse, scaled) = (
-            Row(p, rows.slope, i),
-            rows.mask[i : i + 1],
-            saved.taken[i],
-        )
-        whole = stage(row.dense(gain))
-        drawn = stage(dot(gain, a))
-        error = stage(jnp.where(seen, drawn - weight * scaled, 0.0))
-        spread = stage(0.5 * weight * (scaled * scaled - inverse))
-        side = scaled * (a - whole * drawn)
-        before, image = back_through(whole, seen, gain, b, spread, side)
-        noises.append(jnp.where(seen, dot(gain, image) - scaled * drawn + spread, 0.0))
+    slopes: list[list[Array]] = [[] for _ in p.bands]
+    for block in reversed(blocks(p, rows)):
+        index = len(saved.taken) - 1 - len(residuals)
+        gain, inverse, scaled = saved.taken[index]
+        drawn = stage(apply(gain, a))
+        error = stage(block.shown(drawn - weight * scaled))
+        spread = stage(0.5 * weight[None] * (outer(scaled, scaled) - inverse))
+        side = outer(scaled, stage(a - block.back(drawn)))
+        before, image = back_through(block, gain, b, spread, side)
+        noise = folded_sum(gain * image, 1) - scaled * drawn + linalg.diagonal(spread)
+        noises.append(block.shown(noise))
         residuals.append(error)
-        slopes.append([])
-        ph = gain / inverse
-        for cols in row.unknown:
-            pulled = stage(scaled * a - 2.0 * image)
-            found = apply(patterned.take(cov, cols, 0), pulled)
-            found = found - error * patterned.take(delta, cols, 0)
-            found = found - weight * patterned.take(gain, cols, 0)
-            slopes[-1].append(jnp.where(seen, found, 0.0))
-        if p.bands and i:
-            cov = stage(cov + outer(gain, ph))
-            delta = stage(delta - ph * scaled)
-        a = stage(a - whole * error)
+        if p.bands:
+            pulled = stage(outer(scaled, a) - 2.0 * image)
+            whole = stage(product(pulled, cov) - outer(error, delta) - weight[None] * gain)
+            places = [k for k, (own, _) in enumerate(p.bands) if _meet(own, block)]
+            for k, part in zip(
+                places, patterned.cut(block.shown(whole), block.pattern), strict=True
+            ):
+                slopes[k].insert(0, part)
+        if p.bands and index:
+            cross = saved.crosses[index - 1]
+            cov = stage(cov + transposed_product(gain, cross))
+            delta = stage(delta - folded_sum(along(scaled, cross.shape, 0) * cross, 0))
+        a = stage(a - block.back(error))
         b = before
-    slopes.reverse()
-    places = [[rows for rows, _ in p.bands if i in rows] for i in range(len(slopes))]
-    bands = tuple(
-        stage(jnp.stack([slopes[r][places[r].index(band_rows)] for r in band_rows]))
-        for band_rows, _ in p.bands
-    )
+    bands = tuple(stage(jnp.concatenate(parts)) for parts in slopes)
     noise, residual = (stage(jnp.concatenate(v[::-1])) for v in (noises, residuals))
     return Gained(b, a, cotangent.log_likelihood), Rows(residual, bands, noise, rows.mask)
+
+
+def _meet(rows: tuple[int, ...], block: Block) -> bool:
+    return any(block.start <= row < block.stop for row in rows)
 
 
 @cache
@@ -353,8 +425,9 @@ def update_with_adjoint(p: Pattern) -> Any:
         return update(p, gained, rows)
 
     def forward(gained: Gained, rows: Rows) -> Any:
-        after, smallest, taken = take(p, gained, rows)
-        return (after, smallest), _Saved(after.cov, after.delta, taken, rows)
+        after, smallest, taken, crosses = take(p, gained, rows)
+        later = crosses[1:] if p.bands else []
+        return (after, smallest), _Saved(after.cov, after.delta, taken, later, rows)
 
     def backward(saved: Any, cotangent: Any) -> Any:
         gained, rows = _update_pullback(p, saved, cotangent[0])

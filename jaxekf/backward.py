@@ -20,7 +20,7 @@ from jaxekf import algebra, epochs, linalg, many, patterned
 from jaxekf.algebra import Gained
 from jaxekf.lanes import stage
 from jaxekf.model import Belief
-from jaxekf.patterned import Bands, Pattern, Row
+from jaxekf.patterned import Bands, Pattern
 from jaxekf.recursion import First, Given
 from jaxekf.step import Moment, Track, any_used, begin, look, take_keeping
 from jaxekf.system import System
@@ -169,7 +169,7 @@ def _before_update(
 
 
 def before_rows(p: Pattern, kept: Any, info: Information) -> Information:
-    """``A' a + h s`` and ``A' L A + h h' / S`` with ``A = I - k h'``, of rows that `step.take_keeping`
+    """``A' a + H' s`` and ``A' L A + H' S^-1 H`` with ``A = I - K H``, of rows that `step.take_keeping`
     took."""
     rows, taken = kept
     if many.are_many(rows.mask):
@@ -179,10 +179,10 @@ def before_rows(p: Pattern, kept: Any, info: Information) -> Information:
 
         return lax.scan(one, info, kept, reverse=True)[0]
     vector, matrix = info
-    for i in reversed(range(rows.mask.shape[0])):
-        row, seen = Row(p, rows.slope, i).dense(vector), rows.mask[i : i + 1]
-        gain, inverse, scaled = taken[i]
-        matrix, _ = algebra.back_through(row, seen, gain, matrix, inverse, None)
-        push = jnp.where(seen, scaled - algebra.dot(gain, vector), 0.0)
-        vector = stage(vector + row * push)
+    for block, (gain, inverse, scaled) in reversed(
+        list(zip(algebra.blocks(p, rows), taken, strict=True))
+    ):
+        matrix, _ = algebra.back_through(block, gain, matrix, inverse, None)
+        push = stage(block.shown(scaled - algebra.apply(gain, vector)))
+        vector = stage(vector + block.back(push))
     return Information(vector, matrix)

@@ -86,10 +86,15 @@ def whole(p: Pattern) -> Pattern:
 
 def take(array: Array, index: Sequence[int], axis: int) -> Array:
     """Entries of `array` along `axis`, as slices of consecutive ones."""
-    if list(index) == list(range(array.shape[axis])):
-        return array
-    pieces = [lax.slice_in_dim(array, run[0], run[-1] + 1, axis=axis) for run in _runs(list(index))]
+    pieces = parts(array, index, axis)
     return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
+
+
+def parts(array: Array, index: Sequence[int], axis: int) -> list[Array]:
+    """The same slices one by one."""
+    if list(index) == list(range(array.shape[axis])):
+        return [array]
+    return [lax.slice_in_dim(array, run[0], run[-1] + 1, axis=axis) for run in _runs(list(index))]
 
 
 def _runs(index: Sequence[int]) -> list[list[int]]:
@@ -100,6 +105,18 @@ def _runs(index: Sequence[int]) -> list[list[int]]:
         else:
             runs.append([i])
     return runs
+
+
+def rows_of(p: Pattern, bands: Bands, start: int, stop: int) -> tuple[Pattern, Bands]:
+    """The rows from `start` to before `stop`."""
+    kept, values = [], []
+    for (rows, cols), band in zip(p.bands, bands, strict=True):
+        inside = [i for i, row in enumerate(rows) if start <= row < stop]
+        if inside:
+            kept.append((tuple(rows[i] - start for i in inside), cols))
+            values.append(take(band, inside, 0))
+    part = Pattern((stop - start, p.shape[1]), p.constants[start:stop], tuple(kept))
+    return part, tuple(values)
 
 
 def cut(matrix: Array, p: Pattern) -> Bands:
@@ -116,30 +133,23 @@ def dense(p: Pattern, bands: Bands, lanes: int, dtype: Any) -> Array:
     """The whole matrix, (rows, cols, lanes)."""
     total = jnp.broadcast_to(jnp.asarray(p.base[:, :, None], dtype), (*p.shape, lanes))
     for (rows, cols), band in zip(p.bands, bands, strict=True):
-        wide = _placed(_placed(band, cols, p.shape[1], 1), rows, p.shape[0], 0)
-        total = total + wide
+        for above in _runs(rows):
+            part = take(band, [rows.index(row) for row in above], 0)
+            for left in _runs(cols):
+                block = take(part, [cols.index(col) for col in left], 1)
+                total = _put(total, block, (above[0], left[0], 0))
     return total
 
 
-def _placed(array: Array, index: Sequence[int], size: int, axis: int) -> Array:
-    """`array` spread along `axis` to the places of `index` among zeros, `size` in all."""
-    if len(index) == size:
-        return array
-    pieces, filled, taken = [], 0, 0
+def _put(whole: Array, part: Array, start: tuple[int, ...]) -> Array:
+    """`whole` with `part` from `start` on.
 
-    def zeros(count: int) -> Array:
-        shape = list(array.shape)
-        shape[axis] = count
-        return jnp.zeros(shape, array.dtype)
-
-    for run in _runs(list(index)):
-        if run[0] > filled:
-            pieces.append(zeros(run[0] - filled))
-        pieces.append(lax.slice_in_dim(array, taken, taken + len(run), axis=axis))
-        filled, taken = run[-1] + 1, taken + len(run)
-    if size > filled:
-        pieces.append(zeros(size - filled))
-    return lax.concatenate(pieces, axis)
+    A concatenation that is computed together with what it is made of asks at every number which piece it
+    is in, and keeps the loop from being done on registers of lanes.
+    """
+    return (
+        part if part.shape == whole.shape else stage(lax.dynamic_update_slice(whole, part, start))
+    )
 
 
 def multiply(p: Pattern, bands: Bands, x: Array, axis: int = 0) -> Array:
@@ -151,8 +161,13 @@ def multiply(p: Pattern, bands: Bands, x: Array, axis: int = 0) -> Array:
         stage(_band_times(band, cols, x, axis))
         for band, (_, cols) in zip(bands, p.bands, strict=True)
     ]
-    pieces = []
-    for start, stop in _segments(p):
+    segments = _segments(p)
+    kept = [segment for segment in segments if _keeps(p, segment[0])]
+    shape = (*x.shape[:axis], p.shape[0], *x.shape[axis + 1 :])
+    found = x if kept else jnp.zeros(shape, x.dtype)
+    for start, stop in segments:
+        if (start, stop) in kept:
+            continue
         terms = []
         for col in np.flatnonzero(p.base[start]):
             part = lax.slice_in_dim(x, int(col), int(col) + stop - start, axis=axis)
@@ -162,12 +177,19 @@ def multiply(p: Pattern, bands: Bands, x: Array, axis: int = 0) -> Array:
             if start in rows:
                 at = rows.index(start)
                 terms.append(take(product, range(at, at + stop - start), axis))
-        if not terms:
-            shape = list(x.shape)
-            shape[axis] = stop - start
-            terms.append(jnp.zeros(shape, x.dtype))
-        pieces.append(written_sum(terms))
-    return pieces[0] if len(pieces) == 1 else lax.concatenate(pieces, axis)
+        if not terms and kept:
+            terms.append(jnp.zeros((*shape[:axis], stop - start, *shape[axis + 1 :]), x.dtype))
+        if terms:
+            at = (*([0] * axis), start, *([0] * (x.ndim - axis - 1)))
+            found = _put(found, written_sum(terms), at)
+    return found
+
+
+def _keeps(p: Pattern, start: int) -> bool:
+    """Whether the matrix leaves the numbers from `start` on as they are."""
+    if p.shape[0] != p.shape[1] or any(start in rows for rows, _ in p.bands):
+        return False
+    return np.array_equal(p.base[start], np.eye(p.shape[1])[start])
 
 
 def _band_times(band: Array, cols: tuple[int, ...], x: Array, axis: int) -> Array:
@@ -205,47 +227,3 @@ def _segments(p: Pattern) -> list[tuple[int, int]]:
 
     starts = [row for row in range(p.shape[0]) if row == 0 or not follows(row)]
     return list(zip(starts, [*starts[1:], p.shape[0]], strict=True))
-
-
-class Row:
-    """One row of a matrix: known numbers at some columns, and unknown ones, (columns, lanes), at others."""
-
-    def __init__(self, p: Pattern, bands: Bands, index: int) -> None:
-        self._size = p.shape[1]
-        self._known = [(int(c), float(p.base[index, c])) for c in np.flatnonzero(p.base[index])]
-        self.unknown: list[tuple[int, ...]] = []
-        """Columns of the unknown numbers, of each band."""
-        self._values: list[Array] = []
-        for (rows, cols), band in zip(p.bands, bands, strict=True):
-            if index in rows:
-                self.unknown.append(cols)
-                self._values.append(band[rows.index(index)])
-
-    def dot(self, vector: Array) -> Array:
-        """The row times a vector (n, lanes), (1, lanes)."""
-        terms = [_scaled(vector[c : c + 1], v) for c, v in self._known]
-        for cols, values in zip(self.unknown, self._values, strict=True):
-            terms.append(folded_sum(take(vector, cols, 0) * values, 0, keep=True))
-        return written_sum(terms) if terms else jnp.zeros_like(vector[:1])
-
-    def times(self, matrix: Array) -> Array:
-        """A matrix (n, n, lanes) times the row, (n, lanes)."""
-        terms = [_scaled(matrix[:, c], v) for c, v in self._known]
-        for cols, values in zip(self.unknown, self._values, strict=True):
-            part = take(matrix, cols, 1)
-            terms.append(folded_sum(part * along(values, part.shape, 1), 1))
-        return written_sum(terms) if terms else jnp.zeros_like(matrix[0])
-
-    def dense(self, like: Array) -> Array:
-        """The whole row, as an array like `like`, (n, lanes)."""
-        base = np.zeros((self._size, 1))
-        for column, value in self._known:
-            base[column] = value
-        total = jnp.broadcast_to(jnp.asarray(base, like.dtype), like.shape)
-        for cols, values in zip(self.unknown, self._values, strict=True):
-            total = total + _placed(values, cols, self._size, 0)
-        return total
-
-
-def _scaled(x: Array, value: float) -> Array:
-    return x if value == 1.0 else value * x

@@ -194,7 +194,7 @@ def take_keeping(slope: Pattern, gained: Gained, rows: algebra.Rows) -> tuple[Ga
     if many.are_many(rows.mask):
         return lax.scan(lambda gained, rows: take_keeping(slope, gained, rows), gained, rows)
     slope, rows, _ = algebra.whitened(slope, rows)
-    gained, _, taken = algebra.take(slope, gained, rows)
+    gained, _, taken, _ = algebra.take(slope, gained, rows)
     return gained, (rows, taken)
 
 

@@ -158,21 +158,43 @@ def _frontier(
 ) -> tuple[list[int], set[int]]:
     """The early values that the late operations need, and what is made late all the same.
 
-    What only rearranges an early value is done late, so that fewer numbers are handed over.
+    What only rearranges early values is done late where fewer numbers are handed over for it.
     """
+    sizes = {i: np.prod(spec.shape, dtype=int) for i, spec in enumerate(program.inputs)}
+    for operation in made.values():
+        sizes.update(
+            (o, np.prod(spec.shape, dtype=int))
+            for o, spec in zip(operation.outputs, operation.shapes, strict=True)
+        )
     wanted = [i for operation in late for i in operation.inputs] + list(program.outputs)
     wanted = [i for i in dict.fromkeys(_numbers(wanted)) if i in early]
     needed: list[int] = []
     moved: set[int] = set()
-    while wanted:
-        value = wanted.pop()
-        operation = made.get(value)
-        if operation is not None and operation.primitive.name in _REARRANGED:
-            moved.add(operation.outputs[0])
-            wanted += [i for i in _numbers(operation.inputs) if i in early and i not in moved]
+    for value in sorted(wanted, key=lambda i: -sizes[i]):
+        sources, between = _sources(value, early, made)
+        fresh = [i for i in sources if i not in needed]
+        if sum(sizes[i] for i in fresh) <= sizes[value]:
+            needed += fresh
+            moved |= between
         elif value not in needed:
             needed.append(value)
     return needed, moved
+
+
+def _sources(value: int, early: set[int], made: dict[int, Operation]) -> tuple[list[int], set[int]]:
+    """What a value is rearranged from, and the values on the way."""
+    sources: list[int] = []
+    between: set[int] = set()
+    left = [value]
+    while left:
+        i = left.pop()
+        operation = made.get(i)
+        if operation is not None and operation.primitive.name in _REARRANGED:
+            between.add(operation.outputs[0])
+            left += [k for k in _numbers(operation.inputs) if k in early and k not in between]
+        elif i not in sources:
+            sources.append(i)
+    return sources, between
 
 
 def _numbers(operands: Sequence[Any]) -> list[int]:

@@ -3,6 +3,7 @@
 import atexit
 import ctypes
 import functools
+import gc
 import os
 import shutil
 import sys
@@ -14,10 +15,12 @@ import pytest
 from hypothesis import settings
 
 import jaxekf
+from jaxekf import kernels
 from jaxekf.result import Estimate
+from tuning import descent
 
-# Nearly all tests wait for the compiler, not for what it made. Those of the filter itself, and the long
-# forms, are compiled as users have it.
+# Most tests wait for the compiler, not for what it made. Those of the filter itself, long descents and the
+# long forms are compiled as users have it.
 if os.environ.get("JAXEKF_LONG") != "1":
     os.environ.setdefault("JAXEKF_COMPILE", "quick")
 
@@ -44,6 +47,9 @@ LONGEST = {
 }
 """Files that take minutes. They are begun first, so that neither process waits for the other at the end."""
 
+RUN_LONG = {"test_starts.py", "test_tuning.py", "test_tuning_statistics.py"}
+"""Files whose descents take longer to run than to compile."""
+
 
 def pytest_configure(config):
     # Or pytest-xdist begins with the files of most tests.
@@ -65,8 +71,21 @@ def _forget_compiled_programs():
     the system, which takes half of a process's memory."""
     yield
     jax.clear_caches()
+    gc.collect()  # a file left open is found here, in the file that left it
     if sys.platform == "linux":
         ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compile_descents_well(request):
+    """Descents of many iterations are compiled as users have them."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.name in RUN_LONG:
+            options = {"static_argnums": (0, 1, 2), "compiler_options": kernels.FAST}
+            for name in ("_value", "_value_and_gradient", "_values_and_gradients"):
+                function = getattr(descent, name).__wrapped__
+                patch.setattr(descent, name, jaxekf.jit(function, **options))
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -34,26 +34,8 @@ ARMS = tight.L_SHAPE
 BIAS = np.array([0.02, -0.015, 0.01])
 
 
-def _quick_options():
-    """XLA options under which it compiles in half the time, those that this version knows."""
-    wanted = {
-        "xla_backend_optimization_level": 0,
-        "xla_llvm_disable_expensive_passes": True,
-        "xla_cpu_use_fusion_emitters": False,
-    }
-    known = {}
-    lowered = jax.jit(lambda x: x).lower(1.0)
-    for name, value in wanted.items():
-        try:
-            lowered.compile({name: value})
-        except Exception:
-            continue
-        known[name] = value
-    return known
-
-
 # For comparisons with a tolerance: the last bit may depend on how the filter is compiled.
-quick_jit = partial(jax.jit, compiler_options=_quick_options())
+quick_jit = partial(jax.jit, compiler_options=kernels.QUICK)
 
 # One compiled filter for each model and size, shared by all tests.
 run_filter = jit(ekf.run_filter, static_argnums=0, compiler_options=kernels.FAST)

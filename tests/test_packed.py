@@ -1,5 +1,6 @@
 """Arrays of a loop put together, and the settings of the compiler."""
 
+import gc
 import os
 
 import jax
@@ -58,3 +59,15 @@ def test_set_up_adds_to_the_flags(monkeypatch, before, after):
     for _ in range(2):
         jaxekf.set_up()
         assert os.environ["XLA_FLAGS"] == after
+
+
+@pytest.mark.parametrize(("before", "after"), [(700, 50_000), (90_000, 90_000), (0, 0)])
+def test_set_up_leaves_a_collector_that_looks_seldom(before, after):
+    """A collector that its user switched off, or set to look less often still, made to look again."""
+    usual = gc.get_threshold()
+    try:
+        gc.set_threshold(before, 10, 10)
+        jaxekf.set_up()
+        assert gc.get_threshold()[0] == after
+    finally:
+        gc.set_threshold(*usual)

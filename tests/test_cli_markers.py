@@ -92,7 +92,8 @@ def test_position_is_scored(run, result):
     error = truth_at(run, table["time"]) - estimated
     expected = 1e3 * np.sqrt(np.mean(np.sum(error**2, axis=1)))
     assert judged["position_rmse_mm"] == pytest.approx(expected, rel=1e-6)
-    cov = np.load(result["result"] + "/covariance.npz")["cov_position"]
+    with np.load(result["result"] + "/covariance.npz") as arrays:
+        cov = arrays["cov_position"]
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 3.0
     assert judged["position_nees"] == pytest.approx(nees, rel=1e-6)
     assert 0.1 < nees < 10.0

@@ -270,7 +270,8 @@ def test_the_command_line_adds_exports(tmp_path):
     assert {"estimate.csv", "trajectory.tum", "estimate.h5", "estimate.npz", "result.json"} <= {
         file.name for file in folder.iterdir()
     }
-    cov = np.load(folder / "covariance.npz")
+    with np.load(folder / "covariance.npz") as arrays:
+        cov = dict(arrays)
     for name in ("estimate.h5", "estimate.npz"):
         same(jaxekf.read_export(folder / name)["covariance"], cov["cov"])
     assert read_tum(folder / "trajectory.tum")[1] == cov["time_ns"].tolist()

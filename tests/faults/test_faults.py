@@ -292,7 +292,8 @@ def test_12_columns(folder, old, new):
 def test_13_types_of_binary_files(folder):
     """Would catch strings and floating times that are cast in silence."""
     file = jaxekf.save(plain(folder), folder.parent / "run.npz")
-    held = dict(np.load(file))
+    with np.load(file) as arrays:
+        held = dict(arrays)
     name = next(key for key in held if key.endswith("imu/gyroscope"))
     held.pop("sha256", None)
     for bad in (held[name].astype(str), held[name].astype(object)):

@@ -48,6 +48,11 @@ def apply(matrix: Array, vector: Array) -> Array:
     return folded_sum(matrix * along(vector, matrix.shape, 1), 1)
 
 
+def transposed_apply(matrix: Array, vector: Array) -> Array:
+    """Transposed matrix times vector, (k, i, lanes), (k, lanes) to (i, lanes)."""
+    return folded_sum(matrix * along(vector, matrix.shape, 0), 0)
+
+
 def dot(left: Array, right: Array) -> Array:
     """Scalar product, (n, lanes), (n, lanes) to (1, lanes)."""
     return folded_sum(left * right, 0, keep=True)
@@ -310,11 +315,10 @@ def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Ta
     taken, crosses, smallest, terms = [], [], [], []
     for block in blocks(p, rows):
         seen, noise = block.seen, rows.noise[block.start : block.stop]
-        both = seen[:, None] & seen[None]
         cross = stage(block.shown(block.times(cov)))
         spread = block.times(cross, 1) + on_diagonal(noise)
-        found, pivots = _inverse(stage(jnp.where(both, spread, on_diagonal(jnp.ones_like(noise)))))
-        inverse = stage(jnp.where(both, found, 0.0))
+        found, pivots = _inverse(stage(linalg.mask_covariance(spread, seen)))
+        inverse = stage(jnp.where(seen[:, None] & seen[None], found, 0.0))
         gain = stage(product(inverse, cross))
         residual = rows.residual[block.start : block.stop] - block.times(delta)
         residual = stage(block.shown(residual))
@@ -322,7 +326,7 @@ def take(p: Pattern, gained: Gained, rows: Rows) -> tuple[Gained, Array, list[Ta
         half = stage(cov - transposed_product(gain, cross))
         rest = stage(block.shown(gain * along(noise, gain.shape, 0) - block.times(half)))
         cov = stage(half + transposed_product(rest, gain))
-        delta = stage(delta + folded_sum(along(scaled, cross.shape, 0) * cross, 0))
+        delta = stage(delta + transposed_apply(cross, scaled))
         taken.append(Taken(gain, inverse, scaled))
         crosses.append(cross)
         smallest.append(reduce(jnp.minimum, pivots))
@@ -381,7 +385,7 @@ def _update_pullback(p: Pattern, saved: _Saved, cotangent: Gained) -> tuple[Gain
     delta, cov, rows = saved.delta, saved.cov, saved.rows
     residuals: list[Array] = []
     noises: list[Array] = []
-    slopes: list[list[Array]] = [[] for _ in p.bands]
+    slopes: list[Array] = []
     for block in reversed(blocks(p, rows)):
         index = len(saved.taken) - 1 - len(residuals)
         gain, inverse, scaled = saved.taken[index]
@@ -395,25 +399,18 @@ def _update_pullback(p: Pattern, saved: _Saved, cotangent: Gained) -> tuple[Gain
         residuals.append(error)
         if p.bands:
             pulled = stage(outer(scaled, a) - 2.0 * image)
-            whole = stage(product(pulled, cov) - outer(error, delta) - weight[None] * gain)
-            places = [k for k, (own, _) in enumerate(p.bands) if _meet(own, block)]
-            for k, part in zip(
-                places, patterned.cut(block.shown(whole), block.pattern), strict=True
-            ):
-                slopes[k].insert(0, part)
+            whole = product(pulled, cov) - outer(error, delta) - weight[None] * gain
+            slopes.append(stage(block.shown(whole)))
         if p.bands and index:
             cross = saved.crosses[index - 1]
             cov = stage(cov + transposed_product(gain, cross))
-            delta = stage(delta - folded_sum(along(scaled, cross.shape, 0) * cross, 0))
+            delta = stage(delta - transposed_apply(cross, scaled))
         a = stage(a - block.back(error))
         b = before
-    bands = tuple(stage(jnp.concatenate(parts)) for parts in slopes)
-    noise, residual = (stage(jnp.concatenate(v[::-1])) for v in (noises, residuals))
+    bands = patterned.cut(jnp.concatenate(slopes[::-1]), p) if slopes else ()
+    noise, residual = (jnp.concatenate(v[::-1]) for v in (noises, residuals))
+    bands, noise, residual = stage((bands, noise, residual))
     return Gained(b, a, cotangent.log_likelihood), Rows(residual, bands, noise, rows.mask)
-
-
-def _meet(rows: tuple[int, ...], block: Block) -> bool:
-    return any(block.start <= row < block.stop for row in rows)
 
 
 @cache

@@ -129,12 +129,13 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
         else:
             after.append(operation)
     late = without_dead(program._replace(operations=tuple(after))).operations
-    needed, moved = _frontier(program, late, early, made)
-    places = {o.outputs[0] for o in after} | moved
-    after = [o for o in program.operations if o.outputs[0] in places]
     specs = dict(enumerate(program.inputs))
     for operation in before:
         specs.update(zip(operation.outputs, operation.shapes, strict=True))
+    wanted = _numbers([i for operation in late for i in operation.inputs] + list(program.outputs))
+    needed, moved = _frontier([i for i in dict.fromkeys(wanted) if i in early], early, made, specs)
+    places = {o.outputs[0] for o in after} | moved
+    after = [o for o in program.operations if o.outputs[0] in places]
     tree = jax.tree.structure([0] * len(needed))
     head = without_dead(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
     number = {old: new for new, old in enumerate(needed)}
@@ -154,26 +155,18 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
 
 
 def _frontier(
-    program: Program, late: Sequence[Operation], early: set[int], made: dict[int, Operation]
+    wanted: Sequence[int], early: set[int], made: dict[int, Operation], specs: dict[int, Any]
 ) -> tuple[list[int], set[int]]:
-    """The early values that the late operations need, and what is made late all the same.
+    """What of the early values is handed over for those wanted late, and what is made late all the same.
 
     What only rearranges early values is done late where fewer numbers are handed over for it.
     """
-    sizes = {i: np.prod(spec.shape, dtype=int) for i, spec in enumerate(program.inputs)}
-    for operation in made.values():
-        sizes.update(
-            (o, np.prod(spec.shape, dtype=int))
-            for o, spec in zip(operation.outputs, operation.shapes, strict=True)
-        )
-    wanted = [i for operation in late for i in operation.inputs] + list(program.outputs)
-    wanted = [i for i in dict.fromkeys(_numbers(wanted)) if i in early]
     needed: list[int] = []
     moved: set[int] = set()
-    for value in sorted(wanted, key=lambda i: -sizes[i]):
+    for value in sorted(wanted, key=lambda i: -specs[i].size):
         sources, between = _sources(value, early, made)
         fresh = [i for i in sources if i not in needed]
-        if sum(sizes[i] for i in fresh) <= sizes[value]:
+        if sum(specs[i].size for i in fresh) <= specs[value].size:
             needed += fresh
             moved |= between
         elif value not in needed:

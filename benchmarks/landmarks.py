@@ -9,13 +9,14 @@ import numpy as np
 from jax import Array, lax
 from textbook import correct, linearise, predict
 
-from jaxekf import robust, run_filter, timeline
-from jaxekf.model import Belief, Model, Parameters
+from jaxekf import robust, run_filter
+from jaxekf.estimation import timeline
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.filtering.model import Belief, Model, Parameters
+from jaxekf.filtering.steps import Rows, Steps
 from jaxekf.models import visual
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import Recording
-from jaxekf.simulate_camera import CameraGrade, camera_recording
-from jaxekf.timeline import Rows, Steps
+from jaxekf.recordings.types import Recording
+from jaxekf.simulation.camera_runs import CameraGrade, camera_recording
 
 POINTS = 30
 """Landmarks in (nearly) every image."""

@@ -18,15 +18,16 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from rich.progress import Progress  # noqa: E402
+import jax.numpy as jnp
+import numpy as np
+from rich.progress import Progress
 
-import tuning  # noqa: E402
-from jaxekf import estimation, padding, simulate  # noqa: E402
-from tuning import descent  # noqa: E402
+import tuning
+from jaxekf.estimation import batch, padding
+from jaxekf.simulation import attitude_runs
+from tuning.search import descent
 
-_RATE = simulate.SensorGrade().optical_hz
+_RATE = attitude_runs.SensorGrade().optical_hz
 """Steps a second: the gyroscope is an input, each tracker sample a step."""
 
 
@@ -34,9 +35,9 @@ def recordings(count: int, shortest: int, longest: int) -> list[Any]:
     """Simulated runs whose numbers of steps are drawn evenly."""
     lengths = np.random.default_rng(6).uniform(shortest, longest, count)
     return [
-        simulate.recording(
+        attitude_runs.recording(
             f"run{i}",
-            simulate.free_motion(i, speed_deg=60.0, rest_s=0.1),
+            attitude_runs.free_motion(i, speed_deg=60.0, rest_s=0.1),
             seed=i,
             duration_s=length / _RATE,
         )
@@ -89,14 +90,14 @@ def main() -> None:
             progress.update(task, advance=1, description=what)
 
         runs = recordings(count, shortest, longest)
-        lines = jaxekf.timeline.build_many(model, runs)
+        lines = jaxekf.batch.timeline.build_many(model, runs)
         buckets = len(padding.groups(lines))
         done("estimating")
         found, first = timed(lambda: jaxekf.estimate_many(runs, model))
-        compiled = estimation._run._cache_size()
+        compiled = batch._run._cache_size()
         done("estimating again")
         found, second = timed(lambda: jaxekf.estimate_many(runs, model))
-        again = estimation._run._cache_size() - compiled
+        again = batch._run._cache_size() - compiled
         done("comparing")
         some = [int(i) for i in np.linspace(0, count - 1, compared)]
         worst = difference(model, [lines[i] for i in some], [found[i] for i in some])

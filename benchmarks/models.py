@@ -19,11 +19,12 @@ from clock import Build, build, operations, timed
 from jax import Array, lax
 from textbook import correct, linearise, predict
 
-from jaxekf import get_model, jit, manifold, robust, run_filter_batch
-from jaxekf.ekf import inputs_of
-from jaxekf.interpolation import InputSample
-from jaxekf.model import Belief, Model, Parameters
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf import get_model, jit, robust, run_filter_batch
+from jaxekf.filtering.ekf import inputs_of
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Belief, Model, Parameters
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.geometry import manifold
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import toy_models

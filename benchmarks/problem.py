@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxekf.model import Belief, Model, Parameters
+from jaxekf.filtering.model import Belief, Model, Parameters
+from jaxekf.filtering.steps import Rows, Steps
 from jaxekf.models import loose_additive
-from jaxekf.timeline import Rows, Steps
 
 DT = 0.016
 STEPS = 2000

@@ -73,9 +73,9 @@ def _chain(size: int) -> tuple[Any, Any, Any]:
     """A model of `size` states: parts of three that each drive the one before, two of them measured."""
     import jax.numpy as jnp
 
-    from jaxekf.manifold import Euclidean
-    from jaxekf.model import Belief, Model, Parameters, Sensor
-    from jaxekf.timeline import Rows, Steps
+    from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
+    from jaxekf.filtering.steps import Rows, Steps
+    from jaxekf.geometry.manifold import Euclidean
 
     count = size // 3
     walk = Parameters(0.1, 0.02, 1.0)
@@ -278,7 +278,7 @@ def draw(found: list[Point], slopes: dict[str, float], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from jaxekf.files import whole_file
+    from jaxekf.io.atomic import whole_file
 
     labels = {
         "run length": "steps in one run",

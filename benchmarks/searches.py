@@ -24,20 +24,20 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from clock import timed  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+from clock import timed
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
 
-import tuning  # noqa: E402
-from jaxekf import simulate  # noqa: E402
-from jaxekf.parameters import as_arrays  # noqa: E402
-from jaxekf.recording import Recording, from_scipy, to_scipy  # noqa: E402
-from tuning import descent  # noqa: E402
+import tuning
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.recordings.types import Recording, from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs
+from tuning.search import descent
 
 GYROSCOPE_DEG = np.array([[0.05, 0.0, 0.0], [0.03, 0.06, 0.0], [-0.02, 0.01, 0.03]])
 """Factor of the gyroscope's density, deg/s/sqrt(Hz)."""
@@ -50,10 +50,10 @@ SWEEPS = 20
 
 def correlated(seed: int, duration_s: float) -> Recording:
     """A run whose noise is correlated between axes."""
-    grade = simulate.SensorGrade(gyroscope_deg=0.0, optical_deg=0.0)
-    motion = simulate.free_motion(seed, rest_s=0.5)
+    grade = attitude_runs.SensorGrade(gyroscope_deg=0.0, optical_deg=0.0)
+    motion = attitude_runs.free_motion(seed, rest_s=0.5)
     hidden = [(t, t + 1.0) for t in np.arange(5.0, duration_s, 8.0)]
-    run = simulate.recording(
+    run = attitude_runs.recording(
         f"run-{seed}", motion, seed=seed, duration_s=duration_s, grade=grade, occlusions=hidden
     )
     rng, imu, optical = np.random.default_rng([seed, 7]), run.need_imu(), run.need_optical()
@@ -70,7 +70,7 @@ def start_off(model: Any) -> Any:
     """The planted deviations of each axis, off by `FACTORS`, without correlation."""
     each = {
         "gyroscope": np.sqrt(np.diag(GYROSCOPE_DEG @ GYROSCOPE_DEG.T)),
-        "bias_walk": np.full(3, simulate.SensorGrade().bias_walk_deg),
+        "bias_walk": np.full(3, attitude_runs.SensorGrade().bias_walk_deg),
         "optical": np.sqrt(np.diag(OPTICAL_DEG @ OPTICAL_DEG.T)),
     }
     noise = {name: np.deg2rad(FACTORS[name] * value) for name, value in each.items()}
@@ -81,7 +81,7 @@ def start_off(model: Any) -> Any:
 def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: float) -> float:
     """How many times as long the objective takes with its gradient."""
     aim = tuned.objective
-    groups = tuning.data.prepare_groups(model, runs, need_truth=aim.needs_truth)
+    groups = tuning.objective.data.prepare_groups(model, runs, need_truth=aim.needs_truth)
     counts = descent.total_counts(groups, aim)
     given = model, aim, tuned.layout, np.asarray(tuned.layout.to_free(tuned.start)), tuned.start
 
@@ -160,12 +160,12 @@ def show(found: dict[str, Any]) -> None:
 
 def whole_tuning(count: int, duration_s: float, **how: Any) -> dict[str, Any]:
     """Seconds of a tuning of noise and calibration from runs in memory, compiling included."""
-    grade = simulate.SensorGrade(imu_hz=200.0)
+    grade = attitude_runs.SensorGrade(imu_hz=200.0)
     matrix = np.array([[1.01, 0.004, -0.006], [-0.003, 0.99, 0.005], [0.002, -0.004, 1.005]])
     runs = []
     for seed in range(count):
-        motion = simulate.free_motion(seed, speed_deg=60.0)
-        run = simulate.recording(
+        motion = attitude_runs.free_motion(seed, speed_deg=60.0)
+        run = attitude_runs.recording(
             f"run-{seed}", motion, seed=seed, duration_s=duration_s, grade=grade
         )
         imu = run.need_imu()

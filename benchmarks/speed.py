@@ -31,16 +31,16 @@ jax.config.update("jax_num_cpu_devices", DEVICES)
 jaxekf.set_up()
 jax.config.update("jax_enable_compilation_cache", False)
 
-import numpy as np  # noqa: E402
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-import models  # noqa: E402
-import peers  # noqa: E402
-from clock import Build, build, operations, timed  # noqa: E402
-from models import KINDS, Measured  # noqa: E402
-from problem import NOISE, STEPS, Noise, measurements  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+import models
+import peers
+from clock import Build, build, operations, timed
+from models import KINDS, Measured
+from problem import NOISE, STEPS, Noise, measurements
+from rich.console import Console
+from rich.table import Table
 
 OURS = "jaxekf"
 """Compiled by `jaxekf.jit`, as `estimate` and `tune` are."""

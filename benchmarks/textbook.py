@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf import manifold
-from jaxekf.model import Belief, Model, Parameters
-from jaxekf.timeline import Rows
+from jaxekf.filtering.model import Belief, Model, Parameters
+from jaxekf.filtering.steps import Rows
+from jaxekf.geometry import manifold
 
 
 def predict(model: Model, params: Parameters, belief: Belief, u: Any, dt: Array) -> Belief:

@@ -21,15 +21,15 @@ import jaxekf
 
 jaxekf.set_up()
 
-import numpy as np  # noqa: E402
-from clock import timed  # noqa: E402
-from landmarks import POINTS, Prepared, by_textbook, filtered, prepare, recorded  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+import numpy as np
+from clock import timed
+from landmarks import POINTS, Prepared, by_textbook, filtered, prepare, recorded
+from rich.console import Console
+from rich.table import Table
 
-from jaxekf import jit, run_smoother  # noqa: E402
-from jaxekf.recording import Recording  # noqa: E402
-from jaxekf.timeline import Steps  # noqa: E402
+from jaxekf import jit, run_smoother
+from jaxekf.filtering.steps import Steps
+from jaxekf.recordings.types import Recording
 
 PLAIN, TEXTBOOK = "filter without gates", "textbook JAX without gates"
 

@@ -37,21 +37,23 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import numpy as np  # noqa: E402
-from recorded import parse, piece  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import track  # noqa: E402
-from rich.table import Table  # noqa: E402
+from importlib import import_module
 
-import tuning  # noqa: E402
-from jaxekf import optional, synchronise  # noqa: E402
-from jaxekf.datasets import broad  # noqa: E402
-from jaxekf.metrics import OrientationError, orientation_error  # noqa: E402
-from jaxekf.models import marg  # noqa: E402
-from jaxekf.recording import Floats, Imu, Times, to_scipy  # noqa: E402
-from jaxekf.truth import encoder_at  # noqa: E402
-from tuning.data import prepare_groups  # noqa: E402
-from tuning.objectives import visible_rows  # noqa: E402
+import numpy as np
+from recorded import parse, piece
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import tuning
+from jaxekf.calibration import time_offset
+from jaxekf.evaluation.metrics import OrientationError, orientation_error
+from jaxekf.io.importers import broad
+from jaxekf.models import marg
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.recordings.types import Floats, Imu, Times, to_scipy
+from tuning.objective.data import prepare_groups
+from tuning.objective.objectives import visible_rows
 
 ITERATIONS = 12
 CONSOLE = Console(stderr=True)
@@ -103,7 +105,7 @@ def coarse(trial: jaxekf.Recording) -> jaxekf.Recording:
 
 def start_for(trials: Sequence[jaxekf.Recording]) -> jaxekf.Parameters:
     """The defaults, with the clock at which the trials' motion capture and gyroscope agree."""
-    lags = [synchronise.match(t.need_optical(), t.need_imu(), t.name).latency_s for t in trials]
+    lags = [time_offset.match(t.need_optical(), t.need_imu(), t.name).latency_s for t in trials]
     calibration = marg.DEFAULTS.calibration._replace(clock_offset=np.array(-np.median(lags)))
     return marg.DEFAULTS._replace(calibration=calibration)
 
@@ -138,7 +140,7 @@ def tuned_on(trials: Sequence[jaxekf.Recording], iterations: int) -> tuning.Tune
 
 def vqf(imu: Imu, *, offline: bool) -> Floats:
     """Quaternions (N, 4) of VQF (Laidig and Seel 2023), filtered or offline; its default parameters."""
-    package = optional.need("vqf", "bench")
+    package = import_module("vqf")
     streams = [
         np.ascontiguousarray(a) for a in (imu.gyroscope, imu.accelerometer, imu.magnetometer)
     ]
@@ -157,7 +159,7 @@ def start_of(trial: jaxekf.Recording) -> Floats:
 
 def by_ahrs(gains: Gains, imu: Imu, start: Floats) -> Floats:
     """Quaternions (N, 4), east, north, up, of a filter of `ahrs` from the attitude (4,) it starts at."""
-    filters = optional.need("ahrs.filters", "bench")
+    filters = import_module("ahrs.filters")
     rate = 1e9 / float(np.mean(np.diff(imu.time_ns)))
     if gains.kind == "madgwick":
         made = filters.Madgwick(frequency=rate, gain=gains.proportional)

@@ -27,7 +27,7 @@ from recorded import parse, piece
 
 import jaxekf
 import tuning
-from jaxekf.datasets import broad
+from jaxekf.io.importers import broad
 
 CALIBRATION = ("calibration.clock_offset", "calibration.gyroscope_matrix")
 

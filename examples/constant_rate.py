@@ -20,19 +20,21 @@ from pathlib import Path
 import numpy as np
 
 import jaxekf
-from jaxekf import metrics, plots, simulate
-from jaxekf.truth import encoder_at, encoder_rate_at
+from jaxekf.evaluation import metrics
+from jaxekf.recordings.truth import encoder_at, encoder_rate_at
+from jaxekf.reporting import plots
+from jaxekf.simulation import attitude_runs
 
 REST_S, TURN_S = 60.0, 20.0
 OCCLUSION_S = (REST_S + 10.0, REST_S + 10.5)
-GRADE = simulate.SensorGrade(bias_walk_deg=0.001)
+GRADE = attitude_runs.SensorGrade(bias_walk_deg=0.001)
 MODELS = ("loose", "loose_rate", "loose_additive")
 
 
 def run(seed: int) -> jaxekf.Recording:
     """One experiment."""
-    motion = simulate.constant_rate_motion(-9.0, REST_S)
-    return simulate.recording(
+    motion = attitude_runs.constant_rate_motion(-9.0, REST_S)
+    return attitude_runs.recording(
         f"seed-{seed}",
         motion,
         seed=seed,

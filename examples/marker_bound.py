@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxekf.recording import Floats, to_scipy
-from jaxekf.simulate_tool import GRAVITY_REF, Hidden, Tool, ToolGrade, ToolMotion
+from jaxekf.recordings.types import Floats, to_scipy
+from jaxekf.simulation.marker_runs import GRAVITY_REF, Hidden, Tool, ToolGrade, ToolMotion
 
 _POSITION, _TILT, _SPEED = slice(0, 3), slice(3, 6), slice(6, 9)
 _GYRO, _ACCEL = slice(9, 12), slice(12, 15)

@@ -8,9 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxekf
-from jaxekf import online, plots, pose, simulate_tool
-from jaxekf.recording import Flags, Floats
-from jaxekf.simulate_tool import Hidden, ToolGrade, ToolMotion, raw_yaw
+from jaxekf.estimation import causal
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import Flags, Floats
+from jaxekf.reporting import plots
+from jaxekf.simulation import marker_runs
+from jaxekf.simulation.marker_runs import Hidden, ToolGrade, ToolMotion, raw_yaw
 
 COUNTS = (0, 2, 3)
 MARGIN_S = 0.6
@@ -50,11 +53,11 @@ def _draw_row(
     window: tuple[float, float],
     seed: int,
 ) -> None:
-    run = simulate_tool.tool_recording(
+    run = marker_runs.tool_recording(
         "figure", motion, seed=seed, duration_s=window[1], grade=grade, hidden=hidden
     )
-    made = online.estimate_online(run, "tight", params)
-    raw = pose.from_markers(run.need_markers())
+    made = causal.estimate_online(run, "tight", params)
+    raw = marker_pose.from_markers(run.need_markers())
     assert raw.position is not None
     known = run.need_encoder()
     assert known.position is not None

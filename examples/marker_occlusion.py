@@ -26,16 +26,20 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from marker_bound import PRIOR, Bound, bound, density_factor, scaled  # noqa: E402
-from marker_figure import draw  # noqa: E402
-from rich.progress import Progress  # noqa: E402
+import jax.numpy as jnp
+import numpy as np
+from marker_bound import PRIOR, Bound, bound, density_factor, scaled
+from marker_figure import draw
+from rich.progress import Progress
 
-from jaxekf import ekf, estimation, metrics, online, parameters, pose, simulate_tool, timeline  # noqa: E402
-from jaxekf.models import tight  # noqa: E402
-from jaxekf.recording import Floats  # noqa: E402
-from jaxekf.simulate_tool import ToolGrade  # noqa: E402
+from jaxekf.estimation import batch, causal, parameters, timeline
+from jaxekf.evaluation import metrics
+from jaxekf.filtering import ekf
+from jaxekf.models import tight
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import Floats
+from jaxekf.simulation import marker_runs
+from jaxekf.simulation.marker_runs import ToolGrade
 
 DURATION_S, HIDDEN_S = 18.0, 15.0
 WINDOW = (HIDDEN_S, DURATION_S)
@@ -44,7 +48,7 @@ ORDER = ("3", "2", "1")
 PAPER_X_MM = (0.12, 0.15, 0.17, 29.2)
 PAPER_YAW = (0.0006, 0.0011, 0.0010, 0.0009)
 BATCH = 40
-MOTION = simulate_tool.sinusoidal_motion()
+MOTION = marker_runs.sinusoidal_motion()
 
 
 def hidden(count: int) -> list[tuple[str, float, float]]:
@@ -74,7 +78,7 @@ class Layout(NamedTuple):
     line: timeline.Timeline
     last: int
     """The last epoch before markers are hidden."""
-    ahead: online.Outlook
+    ahead: causal.Outlook
     """From each epoch whose belief is told in the window."""
     first: int
     """The first of those epochs."""
@@ -92,11 +96,11 @@ def yaw_of(q: Any) -> Any:
 
 def lay_out(grade: ToolGrade) -> Layout:
     """The layout of a run, from the first seed's."""
-    recording = simulate_tool.tool_recording(
+    recording = marker_runs.tool_recording(
         "layout", MOTION, seed=0, duration_s=DURATION_S, grade=grade
     )
     line = timeline.build(tight.MODEL, recording)
-    view = online.outlook(line, recording.need_markers().latency_ns)
+    view = causal.outlook(line, recording.need_markers().latency_ns)
     inside = (view.time_ns >= HIDDEN_S * 1e9) & (view.time_ns < DURATION_S * 1e9) & view.wanted
     chosen = np.flatnonzero(inside.any(axis=1))
     first = int(chosen[0])
@@ -122,7 +126,7 @@ def record(seeds: range, grade: ToolGrade) -> Samples:
     """The same run recorded once for each seed."""
     imu, markers = [], []
     for seed in seeds:
-        one = simulate_tool.tool_recording(
+        one = marker_runs.tool_recording(
             "run", MOTION, seed=seed, duration_s=DURATION_S, grade=grade
         )
         stream = one.need_imu()
@@ -133,10 +137,10 @@ def record(seeds: range, grade: ToolGrade) -> Samples:
 
 def starts(samples: Samples) -> Any:
     """First states, from the pose of the first frame and the step to the second."""
-    arms = simulate_tool.Tool().p_body_marker
+    arms = marker_runs.Tool().p_body_marker
     seen = np.ones((*samples.markers.shape[:1], 3), bool)
-    one, two = (pose.absolute_orientation(arms, samples.markers[:, k], seen) for k in (0, 1))
-    speed = (two.position - one.position) / simulate_tool.ToolGrade().tracker_s
+    one, two = (marker_pose.absolute_orientation(arms, samples.markers[:, k], seen) for k in (0, 1))
+    speed = (two.position - one.position) / marker_runs.ToolGrade().tracker_s
     known = {"position": one.position, "q_ref_body": one.q_ref_body, "velocity": speed}
     return jax.vmap(tight.MODEL.initial_mean)(jax.tree.map(jnp.asarray, known))
 
@@ -192,7 +196,7 @@ class Running:
             belief,
             steps,
             keep="estimates",
-            devices=estimation.sharing_devices(),
+            devices=batch.sharing_devices(),
         )
         return jax.tree.map(lambda a: a[:, :, -1], output.instants.updated)
 
@@ -215,7 +219,7 @@ class Running:
         ahead = jax.vmap(lambda knots: layout.ahead.with_input(knots).knots)(steps.knots)
         count = layout.ahead.time_ns.shape[0]
         flat = partial(jax.tree.map, lambda a: a.reshape(seeds * count, *a.shape[2:]))
-        told = online.carry_on(
+        told = causal.carry_on(
             tight.MODEL,
             repeated(params, seeds * count),
             flat(beliefs),
@@ -245,7 +249,7 @@ def errors(
         real = min(batch, seeds - start)
         before = running.common(params, starts(samples), samples)
         for count in range(4):
-            shown = np.array([n not in ORDER[:count] for n in simulate_tool.Tool().names])
+            shown = np.array([n not in ORDER[:count] for n in marker_runs.Tool().names])
             total = running.branch(params, before, samples, shown)
             squares[count] += np.asarray(total)[:, :real].sum(axis=1)
         progress.update(task, advance=real)
@@ -257,8 +261,8 @@ def raw_errors(seeds: int) -> dict[str, Bound]:
     """The tracker alone: each frame against the truth of when it was taken, and held until the next."""
     exact, late = [], []
     for seed in range(min(seeds, 100)):
-        run = simulate_tool.tool_recording("run", MOTION, seed=seed, duration_s=DURATION_S)
-        raw, imu = pose.from_markers(run.need_markers()), run.need_imu()
+        run = marker_runs.tool_recording("run", MOTION, seed=seed, duration_s=DURATION_S)
+        raw, imu = marker_pose.from_markers(run.need_markers()), run.need_imu()
         assert raw.position is not None
         inside = (imu.time_ns >= WINDOW[0] * 1e9) & (imu.time_ns < WINDOW[1] * 1e9)
         t = imu.time_ns[inside]
@@ -282,14 +286,14 @@ def raw_errors(seeds: int) -> dict[str, Bound]:
 
 def cyclic(seeds: int) -> dict[str, list[float]]:
     """One marker at a time for 60 s: position (mm) and attitude (rad) RMSE by stretches of 10 s."""
-    names, duration = simulate_tool.Tool().names, 60.0
+    names, duration = marker_runs.Tool().names, 60.0
     runs = [
-        simulate_tool.tool_recording(
+        marker_runs.tool_recording(
             f"cyclic-{seed}",
             MOTION,
             seed=seed,
             duration_s=duration,
-            hidden=simulate_tool.cyclic(names, duration, 5.0),
+            hidden=marker_runs.cyclic(names, duration, 5.0),
         )
         for seed in range(seeds)
     ]

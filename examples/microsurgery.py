@@ -29,14 +29,16 @@ from jax import Array
 from rich.progress import Progress
 
 import jaxekf
-from jaxekf import consistency, metrics, rotation, simulate_surgery
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.evaluation import consistency, metrics
+from jaxekf.geometry import rotation
 from jaxekf.models import triad
-from jaxekf.parameters import as_arrays
-from jaxekf.plots import style
-from jaxekf.recording import Flags, Floats
-from jaxekf.simulate_tool import ToolMotion
+from jaxekf.recordings.types import Flags, Floats
+from jaxekf.reporting.plots import style
+from jaxekf.simulation import gyro_free_runs
+from jaxekf.simulation.marker_runs import ToolMotion
 
-GRADE = simulate_surgery.SurgeryGrade()
+GRADE = gyro_free_runs.SurgeryGrade()
 PART_S = 300.0
 """The first and the last part of a run that are compared; a third of it where it is short."""
 SETTLE_S = 5.0
@@ -76,10 +78,10 @@ def parameters(acceleration: float) -> jaxekf.Parameters:
     error of the force: its second order, ``(force error / g)^2 tan(dip)`` at a dip of some 60 deg and more,
     is what the covariance of eqs. 41 to 46 lacks. It is added to the noise of the field.
     """
-    walk = simulate_surgery.rate_walk(simulate_surgery.handheld_array(), GRADE)
+    walk = gyro_free_runs.rate_walk(gyro_free_runs.handheld_array(), GRADE)
     force = np.hypot(GRADE.acceleration_sigma / np.sqrt(2.0), acceleration)
     field = 1e-6 * GRADE.magnetometer_ugauss / GRADE.field_gauss
-    curved = (force / np.linalg.norm(simulate_surgery.GRAVITY_REF)) ** 2
+    curved = (force / np.linalg.norm(gyro_free_runs.GRAVITY_REF)) ** 2
     params = triad.MODEL.parameters
     noise = params.noise._replace(
         rate=walk / (GRADE.hertz * np.sqrt(12.0)),
@@ -95,15 +97,15 @@ def parameters(acceleration: float) -> jaxekf.Parameters:
 
 def run(seed: int, minutes: float, *, body_acceleration: bool = True) -> Run:
     """Simulate and estimate."""
-    motion = simulate_surgery.surgical_motion(seed, body_acceleration=body_acceleration)
-    array = simulate_surgery.handheld_array()
+    motion = gyro_free_runs.surgical_motion(seed, body_acceleration=body_acceleration)
+    array = gyro_free_runs.handheld_array()
     name = "microsurgery" if body_acceleration else "microsurgery, no acceleration"
     begin = time.perf_counter()
-    felt = simulate_surgery.array_run(
+    felt = gyro_free_runs.array_run(
         motion, array, seed=seed, duration_s=60.0 * minutes, grade=GRADE
     )
     made = time.perf_counter()
-    recording = simulate_surgery.array_recording(name, felt, array, grade=GRADE)
+    recording = gyro_free_runs.array_recording(name, felt, array, grade=GRADE)
     rated = time.perf_counter()
     estimate = jaxekf.estimate(recording, "triad", parameters(acceleration_rms(motion)))
     done = time.perf_counter()

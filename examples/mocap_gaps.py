@@ -25,16 +25,16 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import numpy as np  # noqa: E402
-from recorded import parse, piece  # noqa: E402
-from rich.progress import Progress  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+import numpy as np
+from recorded import parse, piece
+from rich.progress import Progress
+from scipy.spatial.transform import Rotation
 
-from jaxekf import synchronise  # noqa: E402
-from jaxekf.datasets import asl  # noqa: E402
-from jaxekf.models import loose_pose  # noqa: E402
-from jaxekf.parameters import as_arrays  # noqa: E402
-from jaxekf.recording import Flags, Floats, Optical, Times, to_scipy  # noqa: E402
+from jaxekf.calibration import time_offset
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.io.importers import asl
+from jaxekf.models import loose_pose
+from jaxekf.recordings.types import Flags, Floats, Optical, Times, to_scipy
 
 SETTLE_S, BETWEEN_S = 8.0, 3.0
 FIT_S, FIT_FRAMES = 0.05, 3
@@ -80,7 +80,7 @@ def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
     )
     calibration = params.calibration
     try:
-        found = synchronise.match(recording.need_optical(), recording.need_imu(), recording.name)
+        found = time_offset.match(recording.need_optical(), recording.need_imu(), recording.name)
     except jaxekf.RecordingError as error:
         print(f"clock and alignment are taken as stated: {error}", file=sys.stderr)
     else:

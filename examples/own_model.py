@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxekf
-from jaxekf import SO3, Euclidean, Input, InputSample, Model, Output, Parameters, Sensor, linalg
+from jaxekf import SO3, Euclidean, Input, InputSample, Model, Output, Parameters, Sensor
+from jaxekf.geometry import linalg
 from jaxekf.models import sources
 
 
@@ -121,7 +122,7 @@ MODEL = Model(
 
 
 def main() -> None:
-    from jaxekf.datasets import demo
+    from jaxekf.simulation import demo
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--smoke", action="store_true", help="the same: it takes seconds")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jaxekf.recording import NANOSECONDS, STREAMS, Recording
+from jaxekf.recordings.types import NANOSECONDS, STREAMS, Recording
 
 DATA = Path(os.environ.get("JAXEKF_DATA", Path(__file__).parents[2] / "shared" / "data"))
 """The folder that `--smoke` looks for data in."""

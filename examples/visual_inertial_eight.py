@@ -26,19 +26,20 @@ import jaxekf
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
 
-import numpy as np  # noqa: E402
-from matplotlib.patches import Ellipse  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import track  # noqa: E402
-from rich.table import Table  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+import numpy as np
+from matplotlib.patches import Ellipse
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.spatial.transform import Rotation
 
-from jaxekf import regions, resection  # noqa: E402
-from jaxekf.model import Belief  # noqa: E402
-from jaxekf.plots import style  # noqa: E402
-from jaxekf.recording import Floats, Recording, Times, to_scipy  # noqa: E402
-from jaxekf.simulate_camera import IMAGE, CameraGrade, camera_recording  # noqa: E402
-from jaxekf.truth import encoder_at  # noqa: E402
+from jaxekf.filtering.model import Belief
+from jaxekf.models import search_regions
+from jaxekf.pose_solvers import pnp
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.recordings.types import Floats, Recording, Times, to_scipy
+from jaxekf.reporting.plots import style
+from jaxekf.simulation.camera_runs import IMAGE, CameraGrade, camera_recording
 
 RATES_HZ = (25.0, 12.5, 6.0, 3.0)
 SECONDS, SETTLED_S = 10.8, 2.0
@@ -90,7 +91,7 @@ def compared(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], lis
     fused, alone = [], []
     for run, one in zip(runs, made, strict=True):
         camera = run.need_camera()
-        raw = resection.poses(camera)
+        raw = pnp.poses(camera)
         settled = camera.time_ns >= camera.time_ns[0] + int(SETTLED_S * 1e9)
         chosen = raw.valid & settled & (camera.time_ns <= one.time_ns[-1])
         at = camera.time_ns[chosen]
@@ -130,7 +131,7 @@ def with_gravity(runs: list[Recording], turn: Rotation | None) -> list[Recording
     return changed
 
 
-def searched(run: Recording) -> tuple[regions.Regions, Floats]:
+def searched(run: Recording) -> tuple[search_regions.Regions, Floats]:
     """Where the points of the first image after the gap are expected before it is looked at, and where they
     are found."""
     camera = run.need_camera()
@@ -141,14 +142,14 @@ def searched(run: Recording) -> tuple[regions.Regions, Floats]:
     there = int(np.searchsorted(one.time_ns, camera.time_ns[image]))
     ahead = Belief(jax.tree.map(lambda a: a[there], one.state), one.cov[there])
     seen = camera.usable[image]
-    found = regions.search_regions(one.params, ahead, camera.p_ref_landmark[seen])
+    found = search_regions.search_regions(one.params, ahead, camera.p_ref_landmark[seen])
     return found, camera.pixel[image, seen]
 
 
 def draw_searched(axes: Any, run: Recording) -> None:
     """The image after the gap: points, and the ellipses within which they were looked for."""
     found, pixel = searched(run)
-    half, angle = regions.ellipses(found)
+    half, angle = search_regions.ellipses(found)
     for centre, axis, turn in zip(np.asarray(found.pixel), half, angle, strict=True):
         ellipse = Ellipse(centre, *(2.0 * axis), angle=np.rad2deg(turn))
         ellipse.set(fill=False, edgecolor=style.ESTIMATE, lw=1.0)
@@ -169,7 +170,7 @@ def figure(run: Recording, one: Any) -> Any:
     path, over, image = axes[0]
     draw_searched(image, run)
     at = encoder_at(run.need_encoder(), one.time_ns)
-    raw = resection.poses(run.need_camera())
+    raw = pnp.poses(run.need_camera())
     place, sigma = one.outputs["position"].value, one.outputs["position"].sigma
     assert at.position is not None
     path.plot(

@@ -5,15 +5,12 @@ Begin with ``jaxekf.set_up()``: it sets JAX to float64 and its compiler to what 
 
 from typing import TYPE_CHECKING
 
-from jaxekf.lazy import attributes
+from jaxekf._support.deprecations import keep_old_names
+from jaxekf._support.lazy import attributes
 
 if TYPE_CHECKING:
-    from jaxekf import manifold, rotation, timeline, unscented, vectors, wahba
-    from jaxekf.consistency import Consistency, Whiteness
-    from jaxekf.datasets import demo
-    from jaxekf.diagnostics import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
-    from jaxekf.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
-    from jaxekf.errors import (
+    from jaxekf._support.compilation import jit, set_up
+    from jaxekf._support.errors import (
         CacheError,
         FilterError,
         JaxekfError,
@@ -22,30 +19,40 @@ if TYPE_CHECKING:
         PrecisionError,
         RecordingError,
         ResourceError,
+        SlowModelWarning,
         TuningError,
     )
-    from jaxekf.estimation import estimate, estimate_many
-    from jaxekf.export import read_export
-    from jaxekf.gaps import split_at_gaps
-    from jaxekf.interpolation import InputSample
-    from jaxekf.iterated import IteratedOutput, run_iterated_smoother, run_iterated_smoother_batch
-    from jaxekf.kernels import jit, set_up
-    from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
-    from jaxekf.metrics import Score, score
-    from jaxekf.model import Belief, Input, Model, Output, Parameters, Sensor, Start
+    from jaxekf._support.program_cache import keep_programs
+    from jaxekf.estimation import timeline
+    from jaxekf.estimation.batch import estimate, estimate_many
+    from jaxekf.estimation.causal import estimate_online
+    from jaxekf.estimation.live import Known, Stream
+    from jaxekf.estimation.output_times import Every, every
+    from jaxekf.estimation.parameters import load as load_parameters
+    from jaxekf.estimation.parameters import save as save_parameters
+    from jaxekf.estimation.result import Estimate, OutputEstimate, SensorRecord
+    from jaxekf.evaluation.consistency import Consistency, Whiteness
+    from jaxekf.evaluation.diagnosis import Diagnosis, SensorDiagnosis, diagnose, diagnose_many
+    from jaxekf.evaluation.metrics import Score, score
+    from jaxekf.evaluation.verdicts import Fault, Verdict
+    from jaxekf.filtering.ekf import FilterOutput, initial_belief, run_filter, run_filter_batch
+    from jaxekf.filtering.interpolation import InputSample
+    from jaxekf.filtering.iterated_smoother import (
+        IteratedOutput,
+        run_iterated_smoother,
+        run_iterated_smoother_batch,
+    )
+    from jaxekf.filtering.model import Belief, Input, Model, Output, Parameters, Sensor, Start
+    from jaxekf.filtering.smoother import SmootherOutput, run_smoother, run_smoother_batch
+    from jaxekf.filtering.steps import Knots, Rows, Steps
+    from jaxekf.geometry.manifold import SO3, AdditiveQuaternion, Euclidean, Manifold
+    from jaxekf.io.export import read_export
+    from jaxekf.io.run_folder import load, save
     from jaxekf.models import get_model
-    from jaxekf.online import estimate_online
-    from jaxekf.parameters import load as load_parameters
-    from jaxekf.parameters import save as save_parameters
-    from jaxekf.program_cache import keep_programs
-    from jaxekf.recording import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
-    from jaxekf.requested import Every, every
-    from jaxekf.result import Estimate, OutputEstimate, SensorRecord
-    from jaxekf.robust_weights import robust
-    from jaxekf.smoother import SmootherOutput, run_smoother, run_smoother_batch
-    from jaxekf.storage import load, save
-    from jaxekf.stream import Known, Stream
-    from jaxekf.verdicts import Fault, Verdict
+    from jaxekf.models.robust import robust
+    from jaxekf.recordings.gaps import split_at_gaps
+    from jaxekf.recordings.types import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
+    from jaxekf.simulation import demo
 
 __version__ = "0.1.0"
 
@@ -69,6 +76,7 @@ __all__ = [
     "InputSample",
     "IteratedOutput",
     "JaxekfError",
+    "Knots",
     "Known",
     "Manifold",
     "Markers",
@@ -83,13 +91,16 @@ __all__ = [
     "Recording",
     "RecordingError",
     "ResourceError",
+    "Rows",
     "Samples",
     "Score",
     "Sensor",
     "SensorDiagnosis",
     "SensorRecord",
+    "SlowModelWarning",
     "SmootherOutput",
     "Start",
+    "Steps",
     "Stream",
     "TuningError",
     "Verdict",
@@ -107,10 +118,8 @@ __all__ = [
     "keep_programs",
     "load",
     "load_parameters",
-    "manifold",
     "read_export",
     "robust",
-    "rotation",
     "run_filter",
     "run_filter_batch",
     "run_iterated_smoother",
@@ -123,17 +132,14 @@ __all__ = [
     "set_up",
     "split_at_gaps",
     "timeline",
-    "unscented",
-    "vectors",
-    "wahba",
 ]
 
 _PLACES = {
-    "jaxekf.consistency": ("Consistency", "Whiteness"),
-    "jaxekf.datasets.demo": ("demo",),
-    "jaxekf.diagnostics": ("Diagnosis", "SensorDiagnosis", "diagnose", "diagnose_many"),
-    "jaxekf.ekf": ("FilterOutput", "initial_belief", "run_filter", "run_filter_batch"),
-    "jaxekf.errors": (
+    "jaxekf._support.compilation": (
+        "jit",
+        "set_up",
+    ),
+    "jaxekf._support.errors": (
         "CacheError",
         "FilterError",
         "JaxekfError",
@@ -142,32 +148,110 @@ _PLACES = {
         "PrecisionError",
         "RecordingError",
         "ResourceError",
+        "SlowModelWarning",
         "TuningError",
     ),
-    "jaxekf.estimation": ("estimate", "estimate_many"),
-    "jaxekf.export": ("read_export",),
-    "jaxekf.gaps": ("split_at_gaps",),
-    "jaxekf.interpolation": ("InputSample",),
-    "jaxekf.iterated": ("IteratedOutput", "run_iterated_smoother", "run_iterated_smoother_batch"),
-    "jaxekf.kernels": ("jit", "set_up"),
-    "jaxekf.manifold": ("SO3", "AdditiveQuaternion", "Euclidean", "Manifold"),
-    "jaxekf.metrics": ("Score", "score"),
-    "jaxekf.model": ("Belief", "Input", "Model", "Output", "Parameters", "Sensor", "Start"),
+    "jaxekf._support.program_cache": ("keep_programs",),
+    "jaxekf.estimation": ("timeline",),
+    "jaxekf.estimation.batch": (
+        "estimate",
+        "estimate_many",
+    ),
+    "jaxekf.estimation.causal": ("estimate_online",),
+    "jaxekf.estimation.live": (
+        "Known",
+        "Stream",
+    ),
+    "jaxekf.estimation.output_times": (
+        "Every",
+        "every",
+    ),
+    "jaxekf.estimation.parameters": (
+        "load_parameters",
+        "save_parameters",
+    ),
+    "jaxekf.estimation.result": (
+        "Estimate",
+        "OutputEstimate",
+        "SensorRecord",
+    ),
+    "jaxekf.evaluation.consistency": (
+        "Consistency",
+        "Whiteness",
+    ),
+    "jaxekf.evaluation.diagnosis": (
+        "Diagnosis",
+        "SensorDiagnosis",
+        "diagnose",
+        "diagnose_many",
+    ),
+    "jaxekf.evaluation.metrics": (
+        "Score",
+        "score",
+    ),
+    "jaxekf.evaluation.verdicts": (
+        "Fault",
+        "Verdict",
+    ),
+    "jaxekf.filtering.ekf": (
+        "FilterOutput",
+        "initial_belief",
+        "run_filter",
+        "run_filter_batch",
+    ),
+    "jaxekf.filtering.interpolation": ("InputSample",),
+    "jaxekf.filtering.iterated_smoother": (
+        "IteratedOutput",
+        "run_iterated_smoother",
+        "run_iterated_smoother_batch",
+    ),
+    "jaxekf.filtering.model": (
+        "Belief",
+        "Input",
+        "Model",
+        "Output",
+        "Parameters",
+        "Sensor",
+        "Start",
+    ),
+    "jaxekf.filtering.smoother": (
+        "SmootherOutput",
+        "run_smoother",
+        "run_smoother_batch",
+    ),
+    "jaxekf.filtering.steps": (
+        "Knots",
+        "Rows",
+        "Steps",
+    ),
+    "jaxekf.geometry.manifold": (
+        "SO3",
+        "AdditiveQuaternion",
+        "Euclidean",
+        "Manifold",
+    ),
+    "jaxekf.io.export": ("read_export",),
+    "jaxekf.io.run_folder": (
+        "load",
+        "save",
+    ),
     "jaxekf.models": ("get_model",),
-    "jaxekf.online": ("estimate_online",),
-    "jaxekf.parameters": ("load_parameters", "save_parameters"),
-    "jaxekf.program_cache": ("keep_programs",),
-    "jaxekf.recording": ("Camera", "Encoder", "Imu", "Markers", "Optical", "Recording", "Samples"),
-    "jaxekf.requested": ("Every", "every"),
-    "jaxekf.result": ("Estimate", "OutputEstimate", "SensorRecord"),
-    "jaxekf.robust_weights": ("robust",),
-    "jaxekf.smoother": ("SmootherOutput", "run_smoother", "run_smoother_batch"),
-    "jaxekf.storage": ("load", "save"),
-    "jaxekf.stream": ("Known", "Stream"),
-    "jaxekf.verdicts": ("Fault", "Verdict"),
+    "jaxekf.models.robust": ("robust",),
+    "jaxekf.recordings.gaps": ("split_at_gaps",),
+    "jaxekf.recordings.types": (
+        "Camera",
+        "Encoder",
+        "Imu",
+        "Markers",
+        "Optical",
+        "Recording",
+        "Samples",
+    ),
+    "jaxekf.simulation": ("demo",),
 }
 _RENAMED = {"load_parameters": "load", "save_parameters": "save"}
 
+keep_old_names()
 if not TYPE_CHECKING:
     # Hidden from type checkers, which would take any name for one that is there.
     __getattr__, __dir__ = attributes(__name__, _PLACES, _RENAMED)

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import settings
 
 import jaxekf
-from jaxekf import kernels
-from jaxekf.result import Estimate
-from tuning import descent
+from jaxekf._support import compilation
+from jaxekf.estimation.result import Estimate
+from tuning.search import descent
 
 # Most tests wait for the compiler, not for what it made. Those of the filter itself, long descents and the
 # long forms are compiled as users have it.
@@ -81,7 +81,7 @@ def _compile_descents_well(request):
     """Descents of many iterations are compiled as users have them."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.name in RUN_LONG:
-            options = {"static_argnums": (0, 1, 2), "compiler_options": kernels.FAST}
+            options = {"static_argnums": (0, 1, 2), "compiler_options": compilation.FAST}
             for name in ("_value", "_value_and_gradient", "_values_and_gradients"):
                 function = getattr(descent, name).__wrapped__
                 patch.setattr(descent, name, jaxekf.jit(function, **options))

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from scipy.stats import chi2
 
-from jaxekf import ekf, manifold
+from jaxekf.filtering import ekf
+from jaxekf.geometry import manifold
 
 
 def _slope(space, function, x, at, size):

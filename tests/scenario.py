@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxekf import ekf, jit, kernels
-from jaxekf.model import Parameters
+from jaxekf import jit
+from jaxekf._support import compilation
+from jaxekf.filtering import ekf
+from jaxekf.filtering.model import Parameters
+from jaxekf.filtering.steps import Knots, Rows, Steps
 from jaxekf.models import loose, loose_additive, loose_rate, tight
-from jaxekf.recording import Camera, Imu, Markers, Optical, Recording, from_scipy
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf.recordings.types import Camera, Imu, Markers, Optical, Recording, from_scipy
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 
@@ -35,10 +37,10 @@ BIAS = np.array([0.02, -0.015, 0.01])
 
 
 # For comparisons with a tolerance: the last bit may depend on how the filter is compiled.
-quick_jit = partial(jax.jit, compiler_options=kernels.QUICK)
+quick_jit = partial(jax.jit, compiler_options=compilation.QUICK)
 
 # One compiled filter for each model and size, shared by all tests.
-run_filter = jit(ekf.run_filter, static_argnums=0, compiler_options=kernels.FAST)
+run_filter = jit(ekf.run_filter, static_argnums=0, compiler_options=compilation.FAST)
 run_filter_quick = quick_jit(ekf.run_filter, static_argnums=0)
 
 QUATERNION_ROWS = {"loose": 3, "loose_rate": 3, "loose_additive": 4}

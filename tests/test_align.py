@@ -10,13 +10,15 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import parameters, simulate, simulate_tool, synchronise
-from jaxekf.alignment import align, align_run, calibration_for, poses, together
-from jaxekf.attitude_match import refine
+from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.calibration import time_offset
+from jaxekf.calibration.alignment import align, align_run, calibration_for, poses, together
+from jaxekf.calibration.attitude_alignment import refine
 from jaxekf.cli import main
-from jaxekf.datasets import broad
-from jaxekf.errors import ModelError, RecordingError
-from jaxekf.recording import Optical, from_scipy, to_scipy
+from jaxekf.estimation import parameters
+from jaxekf.io.importers import broad
+from jaxekf.recordings.types import Optical, from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs, marker_runs
 
 TURN = np.deg2rad([1.0, -2.0, 0.5])
 
@@ -33,8 +35,8 @@ def late(optical, latency_s=0.0, drift=0.0, turn=(0.0, 0.0, 0.0)):
 
 def planted(seed, duration_s=60.0, motion=None, **wrong):
     """A run with a planted offset, drift and alignment."""
-    chosen = motion or simulate.free_motion(seed)
-    run = simulate.recording(f"run-{seed}", chosen, seed=seed, duration_s=duration_s)
+    chosen = motion or attitude_runs.free_motion(seed)
+    run = attitude_runs.recording(f"run-{seed}", chosen, seed=seed, duration_s=duration_s)
     return run.replace(optical=late(run.need_optical(), **wrong))
 
 
@@ -117,7 +119,7 @@ def test_runs_together(aligned):
 
 def test_one_axis_does_not_tell_the_alignment():
     """An alignment about the only axis of turning, which nothing tells, written as if it were known."""
-    motion = replace(simulate.free_motion(0), rate=(0.0, 0.0, 0.0))
+    motion = replace(attitude_runs.free_motion(0), rate=(0.0, 0.0, 0.0))
     amplitude = motion.amplitude * np.array([[0.0], [0.0], [1.0]])
     run = align_run(planted(0, 40.0, replace(motion, amplitude=amplitude), latency_s=0.02))
     assert abs(run.tracker.latency_s - 0.02) < 1e-3
@@ -137,7 +139,7 @@ def test_what_does_not_belong_together_is_refused():
     far = replace(optical, time_ns=optical.time_ns + 1_500_000_000)
     with pytest.raises(RecordingError):
         align(far, imu)
-    start = synchronise.match(optical, imu)
+    start = time_offset.match(optical, imu)
     second = (np.arange(len(optical.time_ns)) > 1000) * 10**9
     jumped = replace(optical, time_ns=optical.time_ns + second)
     with pytest.raises(RecordingError, match="clocks that do not jump"):
@@ -161,8 +163,8 @@ def test_real_lag_of_the_gyroscope(data_dir):
 
 def tool_run(seed, turn):
     """A tool whose tracker reports whole poses, of a frame turned in the body, later than it says."""
-    motion = simulate_tool.free_tool_motion(seed)
-    run = simulate_tool.tool_recording("tool", motion, seed=seed, duration_s=20.0)
+    motion = marker_runs.free_tool_motion(seed)
+    run = marker_runs.tool_recording("tool", motion, seed=seed, duration_s=20.0)
     optical = late(poses(run), latency_s=0.06, turn=turn)
     return run.replace(optical=optical, markers=None, encoder=late(run.need_encoder(), 0.06))
 

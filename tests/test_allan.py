@@ -11,13 +11,15 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import allan, parameters, rest, simulate, simulate_tool
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration import allan, static_interval
+from jaxekf.calibration.noise_densities import fit
+from jaxekf.calibration.static_noise import start_for, static_noise
 from jaxekf.cli import main
-from jaxekf.datasets import adis
-from jaxekf.densities import fit
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Imu, Recording, from_scipy, to_scipy
-from jaxekf.static_noise import start_for, static_noise
+from jaxekf.estimation import parameters
+from jaxekf.io.importers import adis
+from jaxekf.recordings.types import Imu, Recording, from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs, marker_runs
 
 PERIOD_S = 0.01
 
@@ -31,8 +33,8 @@ def samples(seed, count, white, walk):
 
 def still(seed, duration_s=20.0, grade=None, rest_s=1e3, motion=None):
     """A run of a tracker and a gyroscope that rests, at first or throughout."""
-    chosen = motion or simulate.free_motion(seed, rest_s=rest_s)
-    return simulate.recording("still", chosen, seed=seed, duration_s=duration_s, grade=grade)
+    chosen = motion or attitude_runs.free_motion(seed, rest_s=rest_s)
+    return attitude_runs.recording("still", chosen, seed=seed, duration_s=duration_s, grade=grade)
 
 
 def call(*arguments):
@@ -159,15 +161,17 @@ def test_missing_samples_are_bridged_and_gaps_cut():
 def test_the_rest_is_found(rest_s):
     """Motion counted as noise, or rest thrown away."""
     for seed in range(3):
-        assert rest_s - 1.1 <= rest.quiet_s(still(seed, rest_s=rest_s).need_imu()) <= rest_s
+        assert (
+            rest_s - 1.1 <= static_interval.quiet_s(still(seed, rest_s=rest_s).need_imu()) <= rest_s
+        )
 
 
 def test_what_does_not_rest_is_refused():
     """Noise of a motion: one that begins at once, and a steady turn, which looks like a bias."""
     with pytest.raises(RecordingError, match="of rest at the start"):
-        rest.static_head(still(0, rest_s=1.0))
+        static_interval.static_head(still(0, rest_s=1.0))
     with pytest.raises(RecordingError, match="tracker that turns by"):
-        rest.static_head(still(0, motion=simulate.constant_rate_motion(-1.0, 0.0)))
+        static_interval.static_head(still(0, motion=attitude_runs.constant_rate_motion(-1.0, 0.0)))
     with pytest.raises(RecordingError, match="stretch from 30"):
         static_noise(still(0), 30.0, 40.0)
 
@@ -182,7 +186,9 @@ def test_scatter_of_the_tracker():
     )
     q = from_scipy(drifting)
     q[500] = [0.0, 1.0, 0.0, 0.0]
-    found = rest.tracker_noise(run.replace(optical=replace(optical, q_ref_body=q)), 0.0, 20.0, 20.0)
+    found = static_interval.tracker_noise(
+        run.replace(optical=replace(optical, q_ref_body=q)), 0.0, 20.0, 20.0
+    )
     assert found.optical is not None and found.position is not None
     for scatter, truth in ((found.optical, np.deg2rad(0.3)), (found.position, 0.2e-3)):
         np.testing.assert_allclose(scatter.value, truth, rtol=0.06)
@@ -195,9 +201,9 @@ def test_scatter_of_the_tracker():
 @pytest.fixture(scope="module")
 def tool():
     """A tool with markers that lies still."""
-    free = simulate_tool.free_tool_motion(0)
-    lying = replace(free, attitude=simulate.Motion(), amplitude=0.0 * free.amplitude)
-    return simulate_tool.tool_recording("lying", lying, seed=0, duration_s=20.0)
+    free = marker_runs.free_tool_motion(0)
+    lying = replace(free, attitude=attitude_runs.Motion(), amplitude=0.0 * free.amplitude)
+    return marker_runs.tool_recording("lying", lying, seed=0, duration_s=20.0)
 
 
 def test_command_writes_a_start_for_tuning(tool, tmp_path):

@@ -7,9 +7,9 @@ import pytest
 from scenario import LONG
 from scipy.stats import binom
 
-from jaxekf import allan
-from jaxekf.densities import fit
-from jaxekf.recording import Imu
+from jaxekf.calibration import allan
+from jaxekf.calibration.noise_densities import fit
+from jaxekf.recordings.types import Imu
 
 HERTZ, HOURS = 100.0, 2.0
 SAMPLES = int(HERTZ * HOURS * 3600.0)

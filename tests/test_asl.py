@@ -8,9 +8,9 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf.datasets import asl
-from jaxekf.errors import RecordingError
-from jaxekf.recording import to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.io.importers import asl
+from jaxekf.recordings.types import to_scipy
 
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"

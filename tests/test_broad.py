@@ -12,10 +12,10 @@ from scipy.io import savemat
 
 import jaxekf
 import tuning
-from jaxekf.datasets import broad
-from jaxekf.errors import RecordingError
-from jaxekf.metrics import attitude_error
-from jaxekf.recording import NANOSECONDS, Encoder, Imu, Optical
+from jaxekf._support.errors import RecordingError
+from jaxekf.evaluation.metrics import attitude_error
+from jaxekf.io.importers import broad
+from jaxekf.recordings.types import NANOSECONDS, Encoder, Imu, Optical
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "broad_tracker.py"
 

@@ -20,15 +20,17 @@ from scipy.spatial.transform import Rotation
 
 import jaxekf
 import tuning
-from jaxekf import jit, simulate
+from jaxekf import jit
+from jaxekf._support.errors import TuningError
 from jaxekf.cli import main
-from jaxekf.errors import TuningError
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import from_scipy, to_scipy
-from tuning import consistency, noise, objectives
-from tuning.data import prepare_groups
-from tuning.descent import Descent
-from tuning.frame import no_correction
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.recordings.types import from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs
+from tuning.objective import covariance_scale, objectives
+from tuning.objective.data import prepare_groups
+from tuning.parametrisation import free_vector
+from tuning.parametrisation.truth_frame import no_correction
+from tuning.search.descent import Descent
 
 MODEL = jaxekf.get_model("loose")
 OFFSET_S = 0.004
@@ -39,9 +41,9 @@ MOUNTED = np.deg2rad([[0.6, -0.4, 0.5], [-0.5, 0.3, 0.8], [1.0, 0.7, -0.6]])
 def mounted(index, seed=None, duration_s=10.0, **motion):
     """A run whose IMU lags and is turned against the tool."""
     seed = index if seed is None else seed
-    run = simulate.recording(
+    run = attitude_runs.recording(
         f"run-{index}",
-        simulate.free_motion(seed, speed_deg=60.0, rest_s=0.5, **motion),
+        attitude_runs.free_motion(seed, speed_deg=60.0, rest_s=0.5, **motion),
         seed=seed,
         duration_s=duration_s,
     )
@@ -156,7 +158,7 @@ LEAVES = (
 def test_a_run_is_filtered_with_its_own_numbers(values):
     """Would catch an index that is off by a run, or bounds that are not kept or do not invert."""
     base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
-    where = noise.layout(MODEL, base, LEAVES, runs=4)
+    where = free_vector.layout(MODEL, base, LEAVES, runs=4)
     assert len(where.labels()) == len(where.prior) == 28
     free = jnp.asarray(values)
     params = where.from_free(free, base)
@@ -178,8 +180,8 @@ def test_bounds_change_nothing_at_the_start(at):
     that the bounds have bent."""
     start = as_arrays(MODEL.parameters)
     start = start._replace(noise=start.noise._replace(optical=jnp.asarray(at)))
-    bound = noise.layout(MODEL, start, [tuning.Free("noise.optical", bounds=(0.01, 1.0))])
-    free = noise.layout(MODEL, start, ["noise.optical"])
+    bound = free_vector.layout(MODEL, start, [tuning.Free("noise.optical", bounds=(0.01, 1.0))])
+    free = free_vector.layout(MODEL, start, ["noise.optical"])
     here = free.to_free(start)
     np.testing.assert_allclose(bound.to_free(start), here, rtol=0.0, atol=1e-12)
     slope = jax.jacfwd(lambda x: jnp.log(bound.from_free(x, start).noise.optical))(here)
@@ -197,9 +199,9 @@ def test_bounds_change_nothing_at_the_start(at):
 )
 def test_only_free_noise_is_scaled(free, objective, scaled, runs):
     """Would catch noise that a tuning of calibration alone changes by the common scale."""
-    where = noise.layout(MODEL, as_arrays(MODEL.parameters), free)
+    where = free_vector.layout(MODEL, as_arrays(MODEL.parameters), free)
     groups = prepare_groups(MODEL, runs[:1], burn_in_s=0.0, need_truth=True)
-    assert consistency.is_open(objective, groups, where) is scaled
+    assert covariance_scale.is_open(objective, groups, where) is scaled
 
 
 def test_what_an_earlier_tuning_left_is_gone(tuned, tmp_path):
@@ -229,7 +231,9 @@ def test_results_of_one_name_are_refused(runs, tuned):
 def everything():
     """Two short runs with all kinds of parameters free: layout, a point off the start, value, gradient."""
     base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
-    where = noise.layout(MODEL, base, (*LEAVES, "calibration.clock_offset", "initial"), runs=2)
+    where = free_vector.layout(
+        MODEL, base, (*LEAVES, "calibration.clock_offset", "initial"), runs=2
+    )
     data = tuning.prepare(MODEL, [mounted(i, duration_s=1.2) for i in range(2)])
     rng = np.random.default_rng(5)
     free = np.asarray(where.to_free(base)) + 0.1 * rng.standard_normal(len(where.labels()))
@@ -447,7 +451,7 @@ def test_another_tunings_state_is_refused(tmp_path, runs):
 def test_what_makes_no_sense_is_refused(free, words):
     """Would catch a start outside its bounds, and truth where none is."""
     with pytest.raises(TuningError, match=words):
-        noise.layout(MODEL, as_arrays(MODEL.parameters), [free])
+        free_vector.layout(MODEL, as_arrays(MODEL.parameters), [free])
 
 
 SPEC = """

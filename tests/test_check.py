@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from jaxekf import simulate, simulate_tool, storage
+from jaxekf.checks.inspection import find_gaps, inspect
 from jaxekf.cli import main
-from jaxekf.datasets import asl, broad
-from jaxekf.inspection import find_gaps, inspect
-from jaxekf.plots.timeaxis import time_axis
-from jaxekf.recording import Camera
-from jaxekf.rows import Intake, Reason
-from jaxekf.simulate_camera import CameraGrade, camera_recording
+from jaxekf.io import run_folder
+from jaxekf.io.importers import asl, broad
+from jaxekf.recordings.accounts import Intake, Reason
+from jaxekf.recordings.types import Camera
+from jaxekf.reporting.plots.timeaxis import time_axis
+from jaxekf.simulation import attitude_runs, marker_runs
+from jaxekf.simulation.camera_runs import CameraGrade, camera_recording
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 
 
 def free(seed=0, duration_s=12.0, **options):
-    motion = simulate.free_motion(seed, rest_s=0.0)
-    run = simulate.recording(f"free-{seed}", motion, seed=seed, duration_s=duration_s, **options)
+    motion = attitude_runs.free_motion(seed, rest_s=0.0)
+    run = attitude_runs.recording(
+        f"free-{seed}", motion, seed=seed, duration_s=duration_s, **options
+    )
     return run.replace(encoder=None)
 
 
@@ -46,12 +49,12 @@ def test_gaps_are_counted_as_stated():
 
 def test_verdicts_and_exit_status(tmp_path):
     """Scripts that cannot tell good runs from bad ones, or a bad run that keeps others from being told."""
-    fine = storage.save(free(0), tmp_path / "fine")
-    warned = storage.save(late(free(1), 0.02), tmp_path / "late")
+    fine = run_folder.save(free(0), tmp_path / "fine")
+    warned = run_folder.save(late(free(1), 0.02), tmp_path / "late")
     wrong = free(2)
     imu = replace(wrong.imu, gyroscope=np.rad2deg(wrong.imu.gyroscope))
-    wrong = storage.save(wrong.replace(imu=imu), tmp_path / "wrong")
-    occluded = storage.save(free(0, occlusions=[(3.0, 5.0)]), tmp_path / "fine.h5")
+    wrong = run_folder.save(wrong.replace(imu=imu), tmp_path / "wrong")
+    occluded = run_folder.save(free(0, occlusions=[(3.0, 5.0)]), tmp_path / "fine.h5")
     assert run_check(occluded).exit_code == 0
     done = run_check(fine)
     assert done.exit_code == 0, done.output
@@ -78,16 +81,16 @@ def test_verdicts_and_exit_status(tmp_path):
 def test_folder_with_pictures(tmp_path):
     """Pictures of runs of one name that overwrite each other, a folder overwritten unasked, or a crash on
     a run of markers or of one stream."""
-    tool = simulate_tool.tool_recording(
+    tool = marker_runs.tool_recording(
         "tool",
-        simulate_tool.free_tool_motion(1),
+        marker_runs.free_tool_motion(1),
         seed=1,
         duration_s=6.0,
         hidden=[("2", 1.0, 2.0)],
-        grade=simulate_tool.ToolGrade(imu_s=0.01),
+        grade=marker_runs.ToolGrade(imu_s=0.01),
     ).replace(encoder=None)
     alone = free(0).replace(optical=None, name="tool")
-    paths = [storage.save(tool, tmp_path / "a"), storage.save(alone, tmp_path / "b")]
+    paths = [run_folder.save(tool, tmp_path / "a"), run_folder.save(alone, tmp_path / "b")]
     out = tmp_path / "checked"
     done = run_check(*paths, "-o", out)
     assert done.exit_code in (0, 3), done.output
@@ -129,7 +132,7 @@ def test_a_camera(tmp_path):
     """Would catch a camera that check passes over, images with some landmark hidden called masked, or
     without any called seen."""
     run = seen_by_camera(free(0))
-    path, out = storage.save(run, tmp_path / "run"), tmp_path / "checked"
+    path, out = run_folder.save(run, tmp_path / "run"), tmp_path / "checked"
     done = run_check(path, "-o", out)
     assert done.exit_code == 0, done.output
     told = " ".join(done.stdout.split())
@@ -144,7 +147,7 @@ def test_a_camera(tmp_path):
     assert found["hidden"]["lost_s"] == pytest.approx(2.0)
     assert found["masked"] == {"blank": 350}
     assert found["gaps"]["count"] == 0
-    made = storage.load(path)
+    made = run_folder.load(path)
     figure = time_axis(made, inspect(made))
     lanes, legend = figure.axes[0], figure.legends[0]
     assert [label.get_text() for label in lanes.get_yticklabels()] == ["camera", "imu"]
@@ -194,7 +197,7 @@ def eight():
 
 def test_a_camera_as_it_should_be(eight, tmp_path):
     """Would catch warnings of a good camera, or clocks and lengths that are compared and not shown."""
-    path = storage.save(eight, tmp_path / "eight")
+    path = run_folder.save(eight, tmp_path / "eight")
     done = run_check(path, "-o", tmp_path / "out")
     assert done.exit_code == 0, done.output
     told = " ".join(done.stdout.split())
@@ -262,7 +265,7 @@ def test_what_is_warned_of():
     kept = (imu.time_ns < 6_000_000_000) | (imu.time_ns > 6_800_000_000)
     gap = replace(imu, time_ns=imu.time_ns[kept], gyroscope=imu.gyroscope[kept])
     assert "1 gaps of more than 0.5 s" in inspect(run.replace(imu=gap)).warnings[0]
-    still = simulate.recording("rest", simulate.Motion(), seed=0, duration_s=10.0)
+    still = attitude_runs.recording("rest", attitude_runs.Motion(), seed=0, duration_s=10.0)
     found = inspect(still.replace(encoder=None))
     assert found.alignment is None and "little turning" in found.warnings[0]
 

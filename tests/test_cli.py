@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import jaxekf
 from jaxekf.cli import main
-from jaxekf.datasets import demo
+from jaxekf.simulation import demo
 
 
 def call(*arguments):

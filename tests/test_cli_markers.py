@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 import jaxekf
-from jaxekf import pose
 from jaxekf.cli import main
 from jaxekf.cli.comparison import print_comparison
-from jaxekf.datasets import demo
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.simulation import demo
 from tuning import Row
 
 
@@ -55,7 +55,7 @@ def test_simulated_tool_is_as_asked(run):
     one, every = (taken >= 1.0) & (taken < 1.3), (taken >= 1.5) & (taken < 1.6)
     hidden = np.stack([every, one | every, every], axis=1)
     np.testing.assert_array_equal(markers.visible, ~hidden)
-    raw, truth = pose.from_markers(markers), recording.need_encoder()
+    raw, truth = marker_pose.from_markers(markers), recording.need_encoder()
     at = np.searchsorted(truth.time_ns, raw.time_ns - raw.latency_ns)
     corner = markers.position[:, 0] - truth.position[at]
     assert 1e3 * np.nanstd(corner) == pytest.approx(0.231, rel=0.2)

@@ -11,12 +11,16 @@ import scenario
 from scipy.linalg import solve_discrete_are
 from scipy.stats import chi2
 
-from jaxekf import get_model, jit, manifold, metrics, simulate, smoother
-from jaxekf.estimation import estimate_many
-from jaxekf.model import Belief
-from jaxekf.parameters import as_arrays
-from jaxekf.timeline import Knots, Rows, Steps
-from jaxekf.truth import encoder_at
+from jaxekf import get_model, jit
+from jaxekf.estimation.batch import estimate_many
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.evaluation import metrics
+from jaxekf.filtering import smoother
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.geometry import manifold
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.simulation import attitude_runs
 
 RUNS = 200
 TRACKER_S = 0.016
@@ -86,7 +90,7 @@ def monte_carlo(model, params, steps, keys):
         mean = model.initial_mean({})
         cov = model.initial_covariance(params)
         error = jnp.linalg.cholesky(cov) @ jax.random.normal(first, cov.shape[:1])
-        truth, drawn = simulate.draw(
+        truth, drawn = attitude_runs.draw(
             model, params, manifold.retract(model.space, mean, error), steps, second
         )
         return truth, drawn, Belief(mean, cov)
@@ -149,11 +153,11 @@ def test_loose_is_consistent_on_physically_simulated_runs():
     """Would catch a gyroscope density that does not match white noise on single samples, an input
     that is not the interval mean, or a wrong start: here the simulator, not the model, makes the runs."""
     count = 200 if os.environ.get("JAXEKF_LONG") else 40
-    grade = simulate.SensorGrade(gyroscope_deg=0.2, bias_walk_deg=0.1, optical_deg=0.3)
+    grade = attitude_runs.SensorGrade(gyroscope_deg=0.2, bias_walk_deg=0.1, optical_deg=0.3)
     records = [
-        simulate.recording(
+        attitude_runs.recording(
             f"run-{i}",
-            simulate.free_motion(i),
+            attitude_runs.free_motion(i),
             seed=i,
             duration_s=30.0,
             grade=grade,

@@ -11,18 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxekf
-from jaxekf import containers, simulate, simulate_tool
-from jaxekf.errors import RecordingError
-from jaxekf.recording import STREAMS, Camera, Encoder, Imu, Optical, Recording
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import container
+from jaxekf.recordings.types import STREAMS, Camera, Encoder, Imu, Optical, Recording
+from jaxekf.simulation import attitude_runs, marker_runs
 
 BIG = 1_700_000_000_123_456_789
 SUFFIXES = [".h5", ".npz"]
 
 
 def pose_run():
-    run = simulate.recording(
+    run = attitude_runs.recording(
         "pose",
-        simulate.free_motion(3),
+        attitude_runs.free_motion(3),
         seed=2,
         duration_s=1.0,
         start_ns=BIG,
@@ -37,9 +38,9 @@ def pose_run():
 
 
 def marker_run():
-    run = simulate_tool.tool_recording(
+    run = marker_runs.tool_recording(
         "tool",
-        simulate_tool.sinusoidal_motion(),
+        marker_runs.sinusoidal_motion(),
         seed=1,
         duration_s=0.5,
         hidden=[("1", 0.2, 0.3)],
@@ -145,7 +146,7 @@ def test_any_run_comes_back(tmp_path_factory, steps, start, values, hidden, suff
         {"note": "µ\t'\"\n", "n": 3, "list": [1.5, 2.0], "section": {"a": True}},
     )
     folder = tmp_path_factory.mktemp("any")
-    again = containers.load(containers.save(run, folder / f"run{suffix}"))
+    again = container.load(container.save(run, folder / f"run{suffix}"))
     assert_same(run, again)
     assert (again.name, again.info) == (run.name, run.info)
     masked = again.intake["optical"].masked
@@ -270,7 +271,9 @@ def test_markers_of_others_that_are_none(tmp_path):
 
 def test_what_was_saved_is_not_judged_again(tmp_path):
     """Would catch a resting tool of a run that was made in Python masked once it is read again."""
-    run = jaxekf.simulate.recording("run", jaxekf.simulate.free_motion(1), seed=1, duration_s=2.0)
+    run = jaxekf.simulation.attitude_runs.recording(
+        "run", jaxekf.simulation.attitude_runs.free_motion(1), seed=1, duration_s=2.0
+    )
     for stream in (run.optical.q_ref_body, run.optical.position):
         if stream is not None:
             stream[20:40] = stream[20]
@@ -333,7 +336,7 @@ def test_root_is_believed_only_where_it_fits(tmp_path, suffix):
         ({"sha256": 64 * "0"}, "sha256"),
     ):
         assert told in refusal(foreign(path, arrays(), root))
-    containers.save(pose_run(), path, overwrite=True)
+    container.save(pose_run(), path, overwrite=True)
     if suffix == ".h5":
         with h5py.File(path, "a") as file:
             file["imu/gyroscope"].attrs["unit"] = "deg/s"
@@ -361,7 +364,7 @@ def test_no_file(tmp_path, suffix):
     path.write_text("time,qw,qx,qy,qz\n" * 100)
     assert "that is not" in refusal(path)
     other = {".h5": ".npz", ".npz": ".h5"}[suffix]
-    shutil.copy(containers.save(pose_run(), tmp_path / f"other{other}"), path)
+    shutil.copy(container.save(pose_run(), tmp_path / f"other{other}"), path)
     assert f"the suffix {other}" in refusal(path)
     path.unlink()
     path.mkdir()
@@ -371,7 +374,7 @@ def test_no_file(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_truncated(tmp_path, suffix):
     """Would catch a file cut off anywhere that is read, or whose message lacks its sizes."""
-    path = containers.save(pose_run(), tmp_path / f"run{suffix}")
+    path = container.save(pose_run(), tmp_path / f"run{suffix}")
     whole = path.read_bytes()
     told = []
     for size in (1, 5, 20, 100, len(whole) // 3, len(whole) // 2, len(whole) - 1):
@@ -456,11 +459,11 @@ def test_what_cannot_be_saved(tmp_path):
     ):
         for suffix in SUFFIXES:
             with pytest.raises(RecordingError):
-                containers.save(wrong, tmp_path / f"run{suffix}")
+                container.save(wrong, tmp_path / f"run{suffix}")
     assert list(tmp_path.iterdir()) == []
-    path = containers.save(run, tmp_path / "run.h5")
+    path = container.save(run, tmp_path / "run.h5")
     with pytest.raises(RecordingError, match="exists"):
-        containers.save(run, path)
+        container.save(run, path)
     with pytest.raises(RecordingError, match="suffix"):
-        containers.save(run, tmp_path / "run.mat")
-    assert containers.save(run, path, overwrite=True) == path
+        container.save(run, tmp_path / "run.mat")
+    assert container.save(run, path, overwrite=True) == path

@@ -12,10 +12,13 @@ import scenario
 import toy_models
 from scipy.stats import chi2
 
-from jaxekf import ekf, interpolation, linearise, manifold, timeline
-from jaxekf.model import Belief, Model
+from jaxekf.estimation import timeline
+from jaxekf.filtering import _linearisation as linearisation
+from jaxekf.filtering import ekf, interpolation
+from jaxekf.filtering.model import Belief, Model
+from jaxekf.filtering.steps import Rows, Steps
+from jaxekf.geometry import manifold
 from jaxekf.models import REGISTRY
-from jaxekf.timeline import Rows, Steps
 
 TOYS = {model.name: model for model in (toy_models.MARKERS,)}
 MODELS = REGISTRY | TOYS
@@ -121,7 +124,7 @@ def test_retract_and_local(model):
     assert_tree_close(reached, other, 1e-14)
 
 
-linearise_quickly = scenario.quick_jit(linearise.linearise_transition, static_argnums=0)
+linearise_quickly = scenario.quick_jit(linearisation.linearise_transition, static_argnums=0)
 
 
 @partial(scenario.quick_jit, static_argnums=0)
@@ -200,7 +203,7 @@ def test_sensor_jacobians(model):
     for sensor in model.sensors:
         rows = jax.tree.map(lambda a: jnp.asarray(a[1]), seen[sensor.name])
         rows = rows._replace(mask=jnp.ones(sensor.rows, bool))
-        _, h, noise = linearise.linearise_sensor(model, sensor, params, x, u, rows)
+        _, h, noise = linearisation.linearise_sensor(model, sensor, params, x, u, rows)
         errors = sensor_errors(model, sensor, params, x, u, rows.aux, deltas)
         assert_jacobian(h, central(errors, step))
         assert np.linalg.eigvalsh(noise).min() > 0.0

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxekf import get_model, simulate
-from jaxekf.errors import TuningError
-from jaxekf.parameters import as_arrays
-from tuning import consistency, derivative_free, descent, objectives
+from jaxekf import get_model
+from jaxekf._support.errors import TuningError
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.simulation import attitude_runs
+from tuning.objective import covariance_scale, objectives
+from tuning.search import derivative_free, descent
 
 
 def quadratic(x):
@@ -90,7 +92,9 @@ def test_nelder_mead_stays_within_its_evaluations():
 @pytest.fixture(scope="module")
 def runs():
     return [
-        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0)
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0
+        )
         for i in range(2)
     ]
 
@@ -122,7 +126,7 @@ def test_both_lower_the_objective_of_the_tuner(runs, start, search, limit, objec
     assert last.value == found.value < first.value - 0.02
     assert found.evaluations >= last.evaluations
     given, where = (get_model("loose"), objectives.parse(objective)), found.layout
-    groups = tuning.data.prepare_groups(given[0], runs, need_truth=False)
+    groups = tuning.objective.data.prepare_groups(given[0], runs, need_truth=False)
     tuner = descent.Descent(*given, where, found.start, groups, groups, iterations=1)
     off = (found.free - np.asarray(where.to_free(found.start))) / where.prior
     rows = int(objectives.visible_rows(groups[0]))
@@ -136,8 +140,10 @@ def test_an_error_alone_is_rescaled_as_the_tuner_does(runs, start):
     """Would catch covariances whose size nothing has fixed, a scale that moves the best, or a filtering for
     it that is not counted."""
     found = tuning.tune_by_coordinates(runs, start=start, objective="attitude", sweeps=1)
-    groups = tuning.data.prepare_groups(found.model, runs)
-    assert consistency.scale(found.model, found.params, groups, found.layout) == pytest.approx(1.0)
+    groups = tuning.objective.data.prepare_groups(found.model, runs)
+    assert covariance_scale.scale(found.model, found.params, groups, found.layout) == pytest.approx(
+        1.0
+    )
     assert found.filterings == found.evaluations + 1
     plain = tuning.tune_by_coordinates(
         runs, start=start, objective="attitude", sweeps=1, rescale=False

@@ -10,14 +10,18 @@ from click.testing import CliRunner
 from scipy.stats import chi2, kstest
 
 import jaxekf
-from jaxekf import consistency, signatures, simulate, simulate_surgery, simulate_tool, storage
 from jaxekf.cli import main
-from jaxekf.datasets import demo
-from jaxekf.recording import Imu, Recording
+from jaxekf.evaluation import _fault_signatures as fault_signatures
+from jaxekf.evaluation import consistency
+from jaxekf.io import run_folder
+from jaxekf.recordings.types import Imu, Recording
+from jaxekf.simulation import attitude_runs, demo, gyro_free_runs, marker_runs
 
 GRADES = {
-    "ordinary": simulate.SensorGrade(),
-    "poor gyroscope": simulate.SensorGrade(gyroscope_deg=0.2, bias_walk_deg=0.1, optical_deg=0.3),
+    "ordinary": attitude_runs.SensorGrade(),
+    "poor gyroscope": attitude_runs.SensorGrade(
+        gyroscope_deg=0.2, bias_walk_deg=0.1, optical_deg=0.3
+    ),
 }
 MODEL = jaxekf.get_model("loose")
 LATE_NS = 20_000_000
@@ -36,8 +40,8 @@ def matched(grade, **changed):
 
 def runs(grade, seeds, seconds=60.0):
     return [
-        simulate.recording(
-            f"run-{i}", simulate.free_motion(i), seed=i, duration_s=seconds, grade=grade
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i), seed=i, duration_s=seconds, grade=grade
         )
         for i in seeds
     ]
@@ -119,15 +123,15 @@ def test_signatures_are_derivatives_of_the_innovations(pair):
     ]
     base, *others = jaxekf.estimate_many([record, *shifted], MODEL, params)
     made = base.sensors["optical"]
-    gain = signatures._gains(base, "optical", slice(0, 3), made.cov, made.used.all(axis=1))
-    each = signatures._signatures(base, made.time_ns, *gain)
+    gain = fault_signatures._gains(base, "optical", slice(0, 3), made.cov, made.used.all(axis=1))
+    each = fault_signatures._signatures(base, made.time_ns, *gain)
     for other, column in zip(others, (1, 4 + 4), strict=True):
         change = (other.sensors["optical"].residual - made.residual) / step
         expected = each[:, :, column]
         assert np.abs(change - expected)[1:].max() < 0.02 * np.abs(expected).max()
     # A clock offset of the whole tracker: the truth is later samples, so compare sizes by the fit.
     moved = replace(optical, time_ns=optical.time_ns - LATE_NS // 4)
-    found = signatures.find_faults(
+    found = fault_signatures.find_faults(
         jaxekf.estimate(record.replace(optical=moved), MODEL, params), "optical"
     )
     assert found is not None
@@ -158,9 +162,9 @@ def test_outliers_are_not_taken_for_noise(pair):
     optical = pair[0].need_optical()
     q = optical.q_ref_body.copy()
     at = np.random.default_rng(0).uniform(size=len(q)) < 0.02
-    q[at] = simulate.from_scipy(
-        simulate.Rotation.from_quat(np.roll(q[at], -1, axis=1))
-        * simulate.Rotation.from_rotvec(np.full((at.sum(), 3), np.deg2rad(3.0)))
+    q[at] = attitude_runs.from_scipy(
+        attitude_runs.Rotation.from_quat(np.roll(q[at], -1, axis=1))
+        * attitude_runs.Rotation.from_rotvec(np.full((at.sum(), 3), np.deg2rad(3.0)))
     )
     spoilt = pair[0].replace(optical=replace(optical, q_ref_body=q))
     made = jaxekf.estimate(spoilt, MODEL, matched(GRADES["ordinary"]))
@@ -170,9 +174,9 @@ def test_outliers_are_not_taken_for_noise(pair):
 def test_smoothed_runs_and_gaps(pair):
     """Would catch smoothed covariances taken for the filter's, or gaps that look like latency."""
     grade = GRADES["ordinary"]
-    gaps = simulate.recording(
+    gaps = attitude_runs.recording(
         "gaps",
-        simulate.free_motion(5),
+        attitude_runs.free_motion(5),
         seed=5,
         duration_s=30.0,
         grade=grade,
@@ -216,9 +220,9 @@ def test_few_samples_give_no_verdict():
 
 def surgery(seconds):
     """A hand that never rests, with gyroscope, accelerometer and magnetometer; it lies on its side."""
-    array, motion = simulate_surgery.handheld_array(), simulate_surgery.surgical_motion(1)
-    made = simulate_surgery.array_run(motion, array, seed=1, duration_s=seconds)
-    force = simulate_surgery.mean_force(array, made.readings)
+    array, motion = gyro_free_runs.handheld_array(), gyro_free_runs.surgical_motion(1)
+    made = gyro_free_runs.array_run(motion, array, seed=1, duration_s=seconds)
+    force = gyro_free_runs.mean_force(array, made.readings)
     imu = Imu(made.time_ns, made.rate[:, [1, 2, 0]], force[:, [1, 2, 0]], made.field[:, [1, 2, 0]])
     world = {"gravity_ref": [0.0, 0.0, -9.80665], "field_ref": [1.0, 0.0, 0.0]}
     return Recording("hand", None, imu, None, world)
@@ -243,9 +247,9 @@ def test_every_model_can_be_judged(name):
     sensor that is never seen."""
     if name in ("tight", "loose_pose"):
         hidden = [("1", 0.0, 9.0)] if name == "loose_pose" else [("1", 2.0, 9.0)]
-        motion = simulate_tool.sinusoidal_motion()
+        motion = marker_runs.sinusoidal_motion()
         hidden = [] if name == "loose_pose" else hidden
-        run = simulate_tool.tool_recording("run", motion, seed=3, duration_s=6.0, hidden=hidden)
+        run = marker_runs.tool_recording("run", motion, seed=3, duration_s=6.0, hidden=hidden)
     else:
         run = jaxekf.load(demo.FOLDER / "constant-rate")
     made = jaxekf.estimate(run, name)
@@ -349,7 +353,7 @@ def test_whitening_uses_the_visible_rows_alone():
 def test_estimate_says_so_on_the_command_line(tmp_path):
     """Would catch verdicts that only Python sees."""
     run = late(jaxekf.load(demo.FOLDER / "free-5"))
-    storage.save(run, tmp_path / "free-5")
+    run_folder.save(run, tmp_path / "free-5")
     result = CliRunner().invoke(
         main, ["estimate", str(tmp_path / "free-5"), "-o", str(tmp_path / "out"), "--json"]
     )

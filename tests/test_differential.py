@@ -10,15 +10,15 @@ from scipy.linalg import eig
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxekf import kernels
-from jaxekf.differential import angular_rate, restored, track
-from jaxekf.placement import (
+from jaxekf._support import compilation
+from jaxekf.pose_solvers.accelerometer_array import (
     AccelerometerArray,
     _left_out,
     differences,
     exact_readings,
     three_dual_axis,
 )
+from jaxekf.pose_solvers.gyro_free_rate import angular_rate, restored, track
 
 # Arrays have as many axes, of which some may feel nothing, so that one program serves all tests.
 N = 12
@@ -65,9 +65,9 @@ def derivatives(case, tangent, cotangent):
     return forward, jax.vjp(numbers, case)[1](cotangent)[0]
 
 
-prepare = kernels.jit(differences)
-_solve_chunk = kernels.jit(jax.vmap(lambda case: found(**case)))
-_derivative_chunk = kernels.jit(jax.vmap(derivatives))
+prepare = compilation.jit(differences)
+_solve_chunk = compilation.jit(jax.vmap(lambda case: found(**case)))
+_derivative_chunk = compilation.jit(jax.vmap(derivatives))
 
 
 def in_chunks(program, *lists, size=64):
@@ -278,7 +278,7 @@ def test_second_derivative():
     line = [jax.tree.map(lambda at, d, k=k: at + k * step * d, case, way) for k in range(-3, 4)]
     weights = np.array([2, -27, 270, -490, 270, -27, 2]) / (180 * step**2)
     expected = weights @ solve(line).rate
-    got = kernels.jit(second_along)(case, way)
+    got = compilation.jit(second_along)(case, way)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
@@ -377,7 +377,7 @@ def test_derivative_of_the_projection_at_a_lower_rank():
         return np.eye(7) - path(t) @ inverse, inverse
 
     change = tall_change @ wide + tall @ wide_change
-    value, slope = kernels.jit(lambda m, d: jax.jvp(_left_out, (m,), (d,)))(path(0.0), change)
+    value, slope = compilation.jit(lambda m, d: jax.jvp(_left_out, (m,), (d,)))(path(0.0), change)
     step = 1e-5
     for got, there, ahead, behind, rate in zip(
         value, by_numpy(0.0), by_numpy(step), by_numpy(-step), slope, strict=True
@@ -484,7 +484,7 @@ def tracked(case):
     return jnp.sum(got.rate[-1] * jnp.array([1.0, -2.0, 3.0])), got
 
 
-tracked_with_slope = kernels.jit(jax.value_and_grad(tracked, has_aux=True))
+tracked_with_slope = compilation.jit(jax.value_and_grad(tracked, has_aux=True))
 
 
 def test_track():
@@ -543,7 +543,7 @@ def forgetting(case):
     return jnp.sum((got.rate[-1] + 2.0 * whole[-1]) * weights), (got, whole)
 
 
-forgetting_with_slope = kernels.jit(jax.value_and_grad(forgetting, has_aux=True))
+forgetting_with_slope = compilation.jit(jax.value_and_grad(forgetting, has_aux=True))
 
 
 def test_forgotten_rate_is_restored():
@@ -583,7 +583,7 @@ def test_noise_of_a_forgetting_track():
     array = AccelerometerArray(case["positions"], case["axes"])
     readings = [9.8, 1.0, 2.0] @ case["axes"].T + 1e-7 * rng.normal(size=(n, 6))
 
-    @kernels.jit
+    @compilation.jit
     def run(readings):
         none = jnp.zeros(3)
         return track(array, 1e-7, readings, none, interval, jnp.zeros((3, 3)), forget_s=forget)

@@ -8,14 +8,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import metrics, plots, simulate, truth, vectors
-from jaxekf.errors import RecordingError
-from jaxekf.interpolation import InputSample
-from jaxekf.models import earth, marg, triad
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import from_scipy, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.evaluation import metrics
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.geometry import triad as vectors
+from jaxekf.models import _earth as earth
+from jaxekf.models import marg, triad
+from jaxekf.recordings import truth
+from jaxekf.recordings.types import from_scipy, to_scipy
+from jaxekf.reporting import plots
+from jaxekf.simulation import attitude_runs
 
-GRADE = simulate.SensorGrade(
+GRADE = attitude_runs.SensorGrade(
     gyroscope_deg=0.02, bias_walk_deg=0.002, accelerometer=2e-3, magnetometer=0.005, imu_hz=100.0
 )
 
@@ -24,8 +29,8 @@ GRADE = simulate.SensorGrade(
 def runs():
     """Two runs of equal length that begin at rest."""
     return [
-        simulate.recording(
-            f"run-{seed}", simulate.free_motion(seed), seed=seed, duration_s=30.0, grade=GRADE
+        attitude_runs.recording(
+            f"run-{seed}", attitude_runs.free_motion(seed), seed=seed, duration_s=30.0, grade=GRADE
         )
         for seed in (1, 2)
     ]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import linearise
+from jaxekf.filtering import _linearisation as linearisation
 from jaxekf.models import loose_additive
 
 T = 0.016
@@ -17,7 +17,7 @@ def autodiff_jacobians(q, rate):
     model = loose_additive.MODEL
     params = jax.tree.map(jnp.asarray, model.parameters)
     x = loose_additive.State(q, rate, jnp.array([0.01, -0.02, 0.03]))
-    return linearise.linearise_transition(model, params, x, None, jnp.asarray(T))[1:]
+    return linearisation.linearise_transition(model, params, x, None, jnp.asarray(T))[1:]
 
 
 def left_matrix(p):

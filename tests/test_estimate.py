@@ -10,20 +10,20 @@ import pytest
 import scenario
 
 import jaxekf
-from jaxekf import estimation as host
-from jaxekf import metrics, padding, simulate, simulate_camera, simulate_tool, timeline
-from jaxekf.datasets import demo
-from jaxekf.errors import FilterError, ModelError, PrecisionError
+from jaxekf._support.errors import FilterError, ModelError, PrecisionError
+from jaxekf.estimation import batch, padding, timeline
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.evaluation import metrics
 from jaxekf.models import REGISTRY
-from jaxekf.parameters import as_arrays
+from jaxekf.simulation import attitude_runs, camera_runs, demo, marker_runs
 
 README = Path(__file__).parents[1] / "README.md"
 
 
 def record(seed=1, duration_s=4.0, **kwargs):
-    return simulate.recording(
+    return attitude_runs.recording(
         f"run-{seed}",
-        simulate.free_motion(seed, rest_s=0.5),
+        attitude_runs.free_motion(seed, rest_s=0.5),
         seed=seed,
         duration_s=duration_s,
         **kwargs,
@@ -35,9 +35,9 @@ def test_many_equal_single_calls_with_one_compilation():
     records = [record(seed, 2.0) for seed in range(64)]
     together = jaxekf.estimate_many(records)
     singles = [jaxekf.estimate(records[0])]
-    before = host._run._cache_size()
+    before = batch._run._cache_size()
     singles += [jaxekf.estimate(r) for r in records[1:]]
-    assert host._run._cache_size() == before
+    assert batch._run._cache_size() == before
     for one, other in zip(together, singles, strict=True):
         np.testing.assert_allclose(one.attitude.value, other.attitude.value, atol=1e-9)
         np.testing.assert_allclose(one.cov, other.cov, atol=1e-9)
@@ -51,9 +51,9 @@ def test_unequal_lengths_and_buckets():
     sizes = {tuple(map(padding.bucket, (len(s.dt), len(s.knots.time)))) for s in lines}
     assert len(sizes) < len(records)
     together = jaxekf.estimate_many(records)
-    before = host._run._cache_size()
+    before = batch._run._cache_size()
     singles = [jaxekf.estimate(r) for r in records]
-    assert host._run._cache_size() - before <= len(sizes)
+    assert batch._run._cache_size() - before <= len(sizes)
     for one, other, r in zip(together, singles, records, strict=True):
         assert one.time_ns[-1] == r.need_imu().time_ns[-1]
         np.testing.assert_allclose(one.cov, other.cov, rtol=1e-9, atol=1e-18)
@@ -96,15 +96,15 @@ def test_account_is_exact(name):
     r = record(3, occlusions=[(1.0, 1.5)], dropouts=0.05)
     if name in ("tight", "loose_pose"):
         hidden = [(marker, 1.0, 1.6) for marker in "123"]
-        motion = simulate_tool.sinusoidal_motion()
-        r = simulate_tool.tool_recording("run", motion, seed=3, duration_s=3.0, hidden=hidden)
+        motion = marker_runs.sinusoidal_motion()
+        r = marker_runs.tool_recording("run", motion, seed=3, duration_s=3.0, hidden=hidden)
     if name in ("triad", "marg"):
-        grade = simulate.SensorGrade(accelerometer=2e-3, magnetometer=0.01)
+        grade = attitude_runs.SensorGrade(accelerometer=2e-3, magnetometer=0.01)
         r = record(3, grade=grade)
         r.imu.magnetometer[::4] = np.nan
     if name.startswith("visual"):
-        grade = simulate_camera.CameraGrade(points=8, mismatched=0.1)
-        r = simulate_camera.camera_recording(
+        grade = camera_runs.CameraGrade(points=8, mismatched=0.1)
+        r = camera_runs.camera_recording(
             "run", seed=3, duration_s=3.0, grade=grade, blind=((1.0, 1.5),)
         )
         r.camera.pixel[25] = np.nan
@@ -160,9 +160,9 @@ def test_result_is_named_and_complete(tmp_path):
 
 def test_rate_covariance_holds_for_the_rate(tmp_path):
     """Would catch a rate output without the gyroscope's own noise, or with it at the wrong bandwidth."""
-    r = simulate.recording("run", simulate.free_motion(2), seed=2, duration_s=60.0)
+    r = attitude_runs.recording("run", attitude_runs.free_motion(2), seed=2, duration_s=60.0)
     made = jaxekf.estimate(r)
-    from jaxekf.truth import encoder_rate_at
+    from jaxekf.recordings.truth import encoder_rate_at
 
     error = made.rate.value - encoder_rate_at(r.need_encoder(), made.time_ns)
     known = np.isfinite(error).all(axis=1) & (made.time > 5.0)

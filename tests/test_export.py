@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxekf
-from jaxekf import export, files, tables, truth
 from jaxekf.cli import main
-from jaxekf.datasets import demo
-from jaxekf.result import OutputEstimate
+from jaxekf.estimation.result import OutputEstimate
+from jaxekf.io import atomic, csv_table, export
+from jaxekf.recordings import truth
+from jaxekf.simulation import demo
 
 RUN = demo.FOLDER / "free-5"
 QUARTER = [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]
@@ -167,10 +168,12 @@ def test_tum_has_the_position_and_leaves_out_what_is_not_finite(made, tmp_path):
 @given(st.integers(-(2**63), 2**63 - 1))
 def test_times_have_nine_decimals_and_are_exact(time_ns):
     """Would catch a time that passes through a float, or loses its sign below one second."""
-    text = tables.format_seconds(time_ns, decimals=9)
+    text = csv_table.format_seconds(time_ns, decimals=9)
     assert re.fullmatch(r"-?\d+\.\d{9}", text)
     assert Decimal(text) == Decimal(time_ns).scaleb(-9)
-    assert tables.parse_seconds(text) == tables.parse_seconds(tables.format_seconds(time_ns))
+    assert csv_table.parse_seconds(text) == csv_table.parse_seconds(
+        csv_table.format_seconds(time_ns)
+    )
 
 
 def test_evo_reads_the_trajectory_and_finds_the_same_error(tmp_path):
@@ -239,7 +242,7 @@ def test_nothing_is_left_half_written(made, tmp_path, monkeypatch):
     assert old.read_bytes() == b"older"
     with pytest.raises(OSError, match="disk full"):
         made.save(tmp_path / "result", exports=["tum", "hdf5"])
-    with pytest.raises(KeyError), files.whole_file(tmp_path / "new.txt") as file:
+    with pytest.raises(KeyError), atomic.whole_file(tmp_path / "new.txt") as file:
         file.write_text("half")
         raise KeyError
     assert list(tmp_path.iterdir()) == [old]

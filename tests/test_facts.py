@@ -8,8 +8,8 @@ import pytest
 import tomli_w
 
 import jaxekf
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Imu, Recording
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.types import Imu, Recording
 
 FORMS = ["run", "run.h5", "run.npz"]
 NORTH_WEST_UP = {"gravity_ref": [0.0, 0.0, -9.81], "field_ref": [19.8, 0.1, -44.7]}

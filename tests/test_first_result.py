@@ -18,7 +18,7 @@ from scipy import stats
 
 import jaxekf
 import tuning
-from jaxekf import chi_square, program_cache
+from jaxekf._support import chi_square, program_cache
 from jaxekf.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -105,16 +105,16 @@ def test_star_import_and_submodules_work_in_a_new_process():
     """Would catch lazy names that only work in a process that has imported their modules already."""
     code = (
         "import json, jaxekf\nfrom jaxekf import *\nfrom jaxekf.cli import estimate\n"
-        "import jaxekf.robust_weights\n"
+        "import jaxekf.models.robust\n"
         "print(json.dumps([callable(robust), callable(jaxekf.robust), demo.__name__, rotation.__name__,"
-        " jaxekf.storage.__name__]))"
+        " jaxekf.io.run_folder.__name__]))"
     )
     assert run_python(code) == [
         True,
         True,
-        "jaxekf.datasets.demo",
-        "jaxekf.rotation",
-        "jaxekf.storage",
+        "jaxekf.simulation.demo",
+        "jaxekf.geometry.rotation",
+        "jaxekf.io.run_folder",
     ]
 
 

@@ -12,14 +12,17 @@ from scipy.spatial.transform import Rotation
 
 import jaxekf
 import tuning
-from jaxekf import simulate
+from jaxekf._support.errors import TuningError
 from jaxekf.cli import main
 from jaxekf.cli.console import TuningBar
-from jaxekf.errors import TuningError
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import from_scipy, to_scipy
-from tuning import derivative_free, descent, fit, folds, objectives, validation, work
-from tuning.allan_only import allan_only
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.recordings.types import from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs
+from tuning import _tune as fit
+from tuning.comparison import compare, cost, cross_validation
+from tuning.comparison.allan_only import allan_only
+from tuning.objective import objectives
+from tuning.search import derivative_free, descent
 
 OPTIONS = {
     "objective": "attitude+0.01*likelihood",
@@ -31,7 +34,9 @@ OPTIONS = {
 @pytest.fixture(scope="module")
 def runs():
     return [
-        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0)
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0
+        )
         for i in range(3)
     ]
 
@@ -115,14 +120,14 @@ def test_folds_hold_out_every_run_once(runs):
     """Would catch a run that is never held out, or one without truth that is."""
     seven = [runs[0].replace(name=f"run-{i}") for i in range(7)]
     blind = runs[0].replace(name="blind", encoder=None)
-    parts = folds._parts([*seven, blind], [], 3)
+    parts = cross_validation._parts([*seven, blind], [], 3)
     assert sorted(name for part in parts for name in part) == [run.name for run in seven]
     assert sorted(map(len, parts)) == [2, 2, 3]
 
 
 def test_smoothing_is_judged_smoothed(runs, found, monkeypatch):
     """Would catch a tuning of the smoothed error that is judged by what the filter gives."""
-    asked, estimate_many = [], validation.estimate_many
+    asked, estimate_many = [], compare.estimate_many
 
     def tune(seen, **options):
         asked.append(options["smooth"])
@@ -132,8 +137,8 @@ def test_smoothing_is_judged_smoothed(runs, found, monkeypatch):
         asked.append(smooth)
         return estimate_many(runs, model, params)
 
-    monkeypatch.setattr(folds, "tune", tune)
-    monkeypatch.setattr(validation, "estimate_many", plain)
+    monkeypatch.setattr(cross_validation, "tune", tune)
+    monkeypatch.setattr(compare, "estimate_many", plain)
     tuning.cross_validate(runs, smooth=True)
     assert asked == [True] * 5  # three folds, start and tuned
 
@@ -226,8 +231,8 @@ LIMITS = tuning.Limits(sweeps=1, evaluations=12)
 
 @pytest.fixture(scope="module")
 def log():
-    motion = simulate.free_motion(9, rest_s=6.0)
-    return simulate.recording("log", motion, seed=9, duration_s=7.0)
+    motion = attitude_runs.free_motion(9, rest_s=6.0)
+    return attitude_runs.recording("log", motion, seed=9, duration_s=7.0)
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +277,7 @@ def test_what_is_set_beside_learns_from_the_folds_runs(runs, start, log, found, 
 def test_validation_runs_play_no_part_beside(runs, start, log, beside, monkeypatch):
     """Would catch a search without gradients that looks at a validation run."""
     tuned = [fold.tuned for fold in beside.folds]
-    monkeypatch.setattr(folds, "tune", lambda seen, **options: tuned.pop(0))
+    monkeypatch.setattr(cross_validation, "tune", lambda seen, **options: tuned.pop(0))
     again = tuning.cross_validate(
         runs,
         start=start,
@@ -311,12 +316,12 @@ def test_the_cost_of_a_gradient_is_measured():
         start = 0.0
 
         def value(self, at):
-            work.time.sleep(0.002)
+            cost.time.sleep(0.002)
 
         def value_and_gradient(self, at):
-            work.time.sleep(0.010)
+            cost.time.sleep(0.010)
 
-    assert 2.5 < work.gradient_cost(Slow(), seconds=0.1) < 10.0
+    assert 2.5 < cost.gradient_cost(Slow(), seconds=0.1) < 10.0
 
 
 def test_the_tuner_counts_what_it_filters_without_a_gradient(runs, start, found, monkeypatch):
@@ -399,9 +404,9 @@ def test_a_stopped_cross_validation_goes_on(runs, start, log, beside, tmp_path, 
 
 
 def resting(name, rest_s, gyroscope_deg, seed):
-    grade = simulate.SensorGrade(gyroscope_deg=gyroscope_deg, imu_hz=100.0)
-    motion = simulate.free_motion(seed, rest_s=rest_s)
-    return simulate.recording(name, motion, seed=seed, duration_s=rest_s + 1.0, grade=grade)
+    grade = attitude_runs.SensorGrade(gyroscope_deg=gyroscope_deg, imu_hz=100.0)
+    motion = attitude_runs.free_motion(seed, rest_s=rest_s)
+    return attitude_runs.recording(name, motion, seed=seed, duration_s=rest_s + 1.0, grade=grade)
 
 
 def test_allan_only_pools_rests(log):
@@ -411,7 +416,7 @@ def test_allan_only_pools_rests(log):
     one, two = resting("one", 5.0, 0.01, 1), resting("two", 20.0, 0.04, 2)
     moving = one.replace(name="moving", imu=replace(one.imu, gyroscope=one.imu.gyroscope[::-1]))
     found = allan_only(model, model.parameters, [one, moving, two])
-    alone = [jaxekf.static_noise.static_noise(run) for run in (one, two)]
+    alone = [jaxekf.calibration.static_noise.static_noise(run) for run in (one, two)]
     square = [rest.imu.gyroscope.white**2 for rest in alone]
     long = [rest.imu.duration_s for rest in alone]
     expected = np.sqrt((long[0] * square[0] + long[1] * square[1]) / sum(long))
@@ -428,7 +433,7 @@ def test_allan_only_pools_rests(log):
     )
     blind = log.replace(optical=None)
     both = allan_only(model, model.parameters, [one], blind).params.noise
-    rest = jaxekf.static_noise.static_noise(blind)
+    rest = jaxekf.calibration.static_noise.static_noise(blind)
     np.testing.assert_allclose(both.gyroscope, rest.imu.gyroscope.white, rtol=1e-12)
     np.testing.assert_allclose(both.optical, alone[0].tracker.optical.value, rtol=1e-12)
     walk = allan_only(model, model.parameters, [], blind).params.noise.bias_walk

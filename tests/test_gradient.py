@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import get_model, jit, simulate, simulate_camera, simulate_tool
+from jaxekf import get_model, jit
+from jaxekf.estimation.parameters import as_arrays
 from jaxekf.models import REGISTRY
-from jaxekf.parameters import as_arrays
-from tuning import noise, objectives
-from tuning.data import prepare
+from jaxekf.simulation import attitude_runs, camera_runs, marker_runs
+from tuning.objective import objectives
+from tuning.objective.data import prepare
+from tuning.parametrisation import free_vector
 
 TERMS = ("attitude", "rate", "likelihood")
 DURATION_S = 0.8
@@ -30,50 +32,53 @@ NAMES = [name for name in REGISTRY if name not in ("loose_pose", "visual_bilinea
 def perfect(model, record):
     """A run with exact measurements: every residual is exactly zero at the start."""
     if model.name == "tight":
-        grade = simulate_tool.ToolGrade(*[0.0] * 7, imu_s=0.01, tracker_s=0.02)
+        grade = marker_runs.ToolGrade(*[0.0] * 7, imu_s=0.01, tracker_s=0.02)
         return tool(record, 0, STILL, grade)
     if model.name == "visual":
-        grade = simulate_camera.CameraGrade(
-            imu=simulate_tool.ToolGrade(*[0.0] * 7, imu_s=0.01), pixel=0.0
+        grade = camera_runs.CameraGrade(
+            imu=marker_runs.ToolGrade(*[0.0] * 7, imu_s=0.01), pixel=0.0
         )
-        return camera(record, 0, simulate_camera.resting(), grade)
-    grade = simulate.SensorGrade(0.0, 0.0, 0.0, 0.0, 0.0, accelerometer=0.0, magnetometer=0.0)
-    motion = simulate.Motion()
-    return simulate.recording(record, motion, seed=0, duration_s=DURATION_S, grade=grade)
+        return camera(record, 0, camera_runs.resting(), grade)
+    grade = attitude_runs.SensorGrade(0.0, 0.0, 0.0, 0.0, 0.0, accelerometer=0.0, magnetometer=0.0)
+    motion = attitude_runs.Motion()
+    return attitude_runs.recording(record, motion, seed=0, duration_s=DURATION_S, grade=grade)
 
 
 def moving(model, name, seed, rest_s=0.1):
     if model.name == "tight":
-        motion = STILL if rest_s > DURATION_S else simulate_tool.free_tool_motion(seed)
-        grade = simulate_tool.ToolGrade(imu_s=0.01, tracker_s=0.02)
+        motion = STILL if rest_s > DURATION_S else marker_runs.free_tool_motion(seed)
+        grade = marker_runs.ToolGrade(imu_s=0.01, tracker_s=0.02)
         return tool(name, seed, motion, grade)
     if model.name == "visual":
-        motion = simulate_camera.resting() if rest_s > DURATION_S else simulate_camera.eight(seed)
-        return camera(name, seed, motion, simulate_camera.CameraGrade())
-    motion = simulate.free_motion(seed, speed_deg=60.0, rest_s=rest_s)
+        motion = camera_runs.resting() if rest_s > DURATION_S else camera_runs.eight(seed)
+        return camera(name, seed, motion, camera_runs.CameraGrade())
+    motion = attitude_runs.free_motion(seed, speed_deg=60.0, rest_s=rest_s)
     hidden = [(0.3, 0.45)]
-    grade = simulate.SensorGrade(accelerometer=2e-3, magnetometer=0.01)
-    return simulate.recording(
+    grade = attitude_runs.SensorGrade(accelerometer=2e-3, magnetometer=0.01)
+    return attitude_runs.recording(
         name, motion, seed=seed, duration_s=DURATION_S, grade=grade, occlusions=hidden
     )
 
 
 NOTHING = np.zeros((3, 1))
-STILL = simulate_tool.ToolMotion(
-    simulate.Motion(amplitude=NOTHING, frequency=NOTHING, phase=NOTHING), NOTHING, NOTHING, NOTHING
+STILL = marker_runs.ToolMotion(
+    attitude_runs.Motion(amplitude=NOTHING, frequency=NOTHING, phase=NOTHING),
+    NOTHING,
+    NOTHING,
+    NOTHING,
 )
 
 
 def camera(name, seed, motion, grade):
     grade = replace(grade, points=8, camera_hz=25.0)
-    return simulate_camera.camera_recording(
+    return camera_runs.camera_recording(
         name, motion, seed=seed, duration_s=DURATION_S, grade=grade, blind=((0.3, 0.45),)
     )
 
 
 def tool(name, seed, motion, grade):
     hidden = [("1", 0.3, 0.45), ("2", 0.3, 0.45), ("3", 0.4, 0.6)]
-    return simulate_tool.tool_recording(
+    return marker_runs.tool_recording(
         name, motion, seed=seed, duration_s=DURATION_S, grade=grade, hidden=hidden
     )
 
@@ -153,7 +158,7 @@ def test_gradient_matches_central_differences(name, case):
     model = get_model(name)
     data = CASES[case](model)
     base = start_of(model)
-    where = noise.layout(
+    where = free_vector.layout(
         model, base, [s for s in ("noise", "calibration", "initial") if getattr(base, s)]
     )
     free = np.asarray(where.to_free(base))
@@ -178,8 +183,8 @@ def test_gradient_reaches_every_entry_of_a_full_covariance(axes):
     """Would catch a triangular factor whose off-diagonal entries or logarithms have no gradient."""
     model = get_model("loose")
     data = CASES["moving"](model)
-    base = noise.with_axes(model, model.parameters, axes)
-    where = noise.layout(model, base)
+    base = free_vector.with_axes(model, model.parameters, axes)
+    where = free_vector.layout(model, base)
     free = np.asarray(where.to_free(base)) + 0.05 * np.random.default_rng(0).standard_normal(
         len(where.labels())
     )

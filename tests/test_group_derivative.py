@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import rotation
-from jaxekf.group_derivative import derivative
-from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean
+from jaxekf.filtering.lowering.group_derivative import derivative
+from jaxekf.geometry import rotation
+from jaxekf.geometry.manifold import SO3, AdditiveQuaternion, Euclidean
 
 FUNCTIONS = {
     "product": lambda q, v: rotation.product(q, rotation.exp(v)),

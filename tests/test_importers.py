@@ -12,12 +12,12 @@ from click.testing import CliRunner
 from scipy.io import savemat
 
 import jaxekf
-from jaxekf.alignment import align
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration.alignment import align
 from jaxekf.cli import main
 from jaxekf.cli.imports import import_run
-from jaxekf.datasets import asl, broad, formats, ndi, optitrack, repoimu, ros, vicon
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Optical
+from jaxekf.io.importers import asl, broad, formats, ndi, optitrack, repoimu, ros, vicon
+from jaxekf.recordings.types import Optical
 
 HALF = 0.70710678
 LOST = "-3.697314E28"

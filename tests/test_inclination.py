@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxekf import inclination, simulate
-from jaxekf.errors import RecordingError
-from jaxekf.models import earth
-from jaxekf.recording import NANOSECONDS, Imu, Recording, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.models import _earth as earth
+from jaxekf.pose_solvers import tilt
+from jaxekf.recordings.types import NANOSECONDS, Imu, Recording, to_scipy
+from jaxekf.simulation import attitude_runs
 
 GRAVITY = 9.80665
 UP = np.array([0.0, 0.0, 1.0])
@@ -29,7 +30,7 @@ MOUNT = Rotation.from_rotvec([0.7, 0.4, -0.2])
 
 
 def times(hertz, duration_s):
-    return simulate.sample_times(hertz, duration_s, 0)
+    return attitude_runs.sample_times(hertz, duration_s, 0)
 
 
 def shaken(t, strength):
@@ -42,7 +43,7 @@ def carried(motion, time_ns, strength=0.0, noise=(0.0, 0.0, 0.0), seed=0):
     """What an IMU reads in a motion (east, north, up), and its attitudes; noise of gyroscope, accelerometer
     and magnetometer as deviations of samples."""
     rng = np.random.default_rng(seed)
-    t = simulate.seconds(time_ns)
+    t = attitude_runs.seconds(time_ns)
     q, rate = motion.attitude(t)
     truth = to_scipy(q) * MOUNT
     body = truth.inv()
@@ -54,7 +55,7 @@ def carried(motion, time_ns, strength=0.0, noise=(0.0, 0.0, 0.0), seed=0):
 
 def resting(count, noise=(2e-3, 0.02, 0.2), hertz=100.0, seed=0):
     """At rest."""
-    return carried(simulate.Motion(), times(hertz, (count - 1) / hertz), 0.0, noise, seed)[0]
+    return carried(attitude_runs.Motion(), times(hertz, (count - 1) / hertz), 0.0, noise, seed)[0]
 
 
 def apart(one, other):
@@ -79,7 +80,7 @@ def test_turned_is_the_product_of_all_turns(count):
             mean = 0.5 * (rate[i] + rate[i - 1])
             q = q * Rotation.from_rotvec(mean * (time_ns[i] - time_ns[i - 1]) / NANOSECONDS)
         expected.append(q.as_quat())
-    found = inclination.turned(Imu(time_ns, rate))
+    found = tilt.turned(Imu(time_ns, rate))
     assert apart(Rotation.from_quat(expected), to_scipy(found)) < 1e-12
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-14)
 
@@ -87,27 +88,27 @@ def test_turned_is_the_product_of_all_turns(count):
 def test_turned_follows_a_known_motion():
     """Rates held over a period, of first order, where the trapezoid is of second: half the step, a
     quarter of the error."""
-    motion, errors = simulate.free_motion(0, rest_s=0.0), []
+    motion, errors = attitude_runs.free_motion(0, rest_s=0.0), []
     for hertz in (125.0, 250.0):
         imu, truth = carried(motion, times(hertz, 60.0))
-        errors.append(apart(truth[0].inv() * truth, to_scipy(inclination.turned(imu))))
+        errors.append(apart(truth[0].inv() * truth, to_scipy(tilt.turned(imu))))
     assert errors[0] < np.deg2rad(0.02)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
 
 
 def test_up_is_found_in_motion():
     """A low-pass in the body, which lags behind the turns, or none: 2 m/s^2 rms tilt the specific force."""
-    motion = replace(simulate.free_motion(3, rest_s=0.0), rate=(1.5, 0.0, 0.7))
+    motion = replace(attitude_runs.free_motion(3, rest_s=0.0), rate=(1.5, 0.0, 0.7))
     imu, truth = carried(motion, times(100.0, 60.0), 2.0)
     up = truth.inv().apply(UP)
-    late = simulate.seconds(imu.time_ns) > 5.0
-    found = inclination.up_in_body(imu)
+    late = attitude_runs.seconds(imu.time_ns) > 5.0
+    found = tilt.up_in_body(imu)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
     raw = imu.accelerometer / np.linalg.norm(imu.accelerometer, axis=1, keepdims=True)
     off = [np.sqrt(np.mean(angles(x, up)[late] ** 2)) for x in (raw, found)]
     assert off[0] > np.deg2rad(10.0)
     assert off[1] < np.deg2rad(0.5)
-    quick = inclination.up_in_body(imu, settling_s=0.3)
+    quick = tilt.up_in_body(imu, settling_s=0.3)
     assert 3.0 * off[1] < np.sqrt(np.mean(angles(quick, up)[late] ** 2)) < off[0]
 
 
@@ -115,11 +116,11 @@ def test_up_takes_as_long_as_it_says():
     """A corner in rad/s taken for Hz: of a step of the specific force half has come through after the time
     that is asked for."""
     time_ns = times(100.0, 30.0)
-    t = simulate.seconds(time_ns)[:, None]
+    t = attitude_runs.seconds(time_ns)[:, None]
     force = np.where(t < 10.0, GRAVITY * UP, GRAVITY * UP + [0.1, 0.0, 0.0])
     imu = Imu(time_ns, np.zeros((len(time_ns), 3)), force)
     for settling_s in (1.0, 3.0):
-        lean = inclination.up_in_body(imu, settling_s)[:, 0] / (0.1 / GRAVITY)
+        lean = tilt.up_in_body(imu, settling_s)[:, 0] / (0.1 / GRAVITY)
         early, late = (np.argmax(lean > share) / 100.0 - 10.0 for share in (0.5, 0.9))
         assert 0.7 * settling_s < early < 1.3 * settling_s
         assert 1.3 * settling_s < late < 2.5 * settling_s
@@ -131,37 +132,37 @@ def test_up_starts_from_a_tenth_of_a_second():
     for seed in range(10):
         imu = resting(100, (0.0, 1.0, 0.0), seed=seed)
         up = np.tile(MOUNT.inv().apply(UP), (100, 1))
-        off.append(angles(inclination.up_in_body(imu), up)[:5])
+        off.append(angles(tilt.up_in_body(imu), up)[:5])
     assert np.sqrt(np.mean(np.square(off))) < 1.5 * np.sqrt(2.0 / 10.0) / GRAVITY
 
 
 def test_up_knows_nothing_of_what_comes():
     """A filter that runs backwards as well: what an estimate at an instant is judged by may not use later
     samples."""
-    imu, _ = carried(simulate.free_motion(1), times(100.0, 10.0), 1.0)
+    imu, _ = carried(attitude_runs.free_motion(1), times(100.0, 10.0), 1.0)
     cut = Imu(*(a[:600] for a in (imu.time_ns, imu.gyroscope, imu.accelerometer)))
-    whole = inclination.up_in_body(imu)[:600]
-    np.testing.assert_allclose(inclination.up_in_body(cut), whole, atol=1e-12)
+    whole = tilt.up_in_body(imu)[:600]
+    np.testing.assert_allclose(tilt.up_in_body(cut), whole, atol=1e-12)
 
 
 def test_rest_is_told_from_motion():
     """Rest missed, or a motion, a steady turn or a shake without turning taken for it."""
     noise = (2e-3, 0.02, 0.0)
-    motion = simulate.free_motion(0, rest_s=20.0)
+    motion = attitude_runs.free_motion(0, rest_s=20.0)
     imu, _ = carried(motion, times(100.0, 60.0), 0.0, noise)
-    t = simulate.seconds(imu.time_ns)
-    found = inclination.still(imu)
+    t = attitude_runs.seconds(imu.time_ns)
+    found = tilt.still(imu)
     assert not found[t < 0.98].any()
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 20.3].any()
-    turning = simulate.Motion(rate=(0.0, 0.0, np.deg2rad(3.0)), rest_s=20.0)
+    turning = attitude_runs.Motion(rate=(0.0, 0.0, np.deg2rad(3.0)), rest_s=20.0)
     steady, _ = carried(turning, times(100.0, 60.0), 0.0, noise)
-    found = inclination.still(steady)
+    found = tilt.still(steady)
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 21.0].any()
     level = resting(len(t))
     force = level.accelerometer + np.where(t[:, None] > 20.0, shaken(t, 1.0), 0.0)
-    found = inclination.still(replace(level, accelerometer=force))
+    found = tilt.still(replace(level, accelerometer=force))
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 21.0].any()
 
@@ -169,7 +170,7 @@ def test_rest_is_told_from_motion():
 class Stopping(NamedTuple):
     """A motion that ends at 40 s, all at once."""
 
-    motion: simulate.Motion
+    motion: attitude_runs.Motion
 
     def attitude(self, t):
         """As that of the motion."""
@@ -179,9 +180,9 @@ class Stopping(NamedTuple):
 
 def test_rest_is_found_again():
     """A window that grows from the start of the run, in which the motion is for ever."""
-    motion = Stopping(simulate.free_motion(0, rest_s=20.0))
+    motion = Stopping(attitude_runs.free_motion(0, rest_s=20.0))
     imu, _ = carried(motion, times(100.0, 60.0), 0.0, (2e-3, 0.02, 0.0))
-    t, found = simulate.seconds(imu.time_ns), inclination.still(imu)
+    t, found = attitude_runs.seconds(imu.time_ns), tilt.still(imu)
     assert found[((t > 1.0) & (t < 20.0)) | (t > 41.2)].mean() > 0.95
     assert not found[(t > 20.5) & (t < 40.9)].any()
 
@@ -191,33 +192,33 @@ def test_gentle_and_quick_motion_is_none(axis):
     """A bound that is not the sensor's own, or one that a tremor without rest sets itself; a motion about
     one axis of which the others do not tell."""
     time_ns = times(100.0, 60.0)
-    t, rng = simulate.seconds(time_ns), np.random.default_rng(axis)
+    t, rng = attitude_runs.seconds(time_ns), np.random.default_rng(axis)
     own = 2e-4 * rng.standard_normal((len(t), 3))
     moves = np.eye(3)[axis] * np.sqrt(2.0) * np.sin(2.0 * np.pi * 8.3 * t)[:, None]
     gentle = own + np.where(t[:, None] > 20.0, np.deg2rad(0.3) * moves, 0.0)
-    found = inclination.still(Imu(time_ns, gentle))
+    found = tilt.still(Imu(time_ns, gentle))
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 20.5].any()
-    assert not inclination.still(Imu(time_ns, own + np.deg2rad(3.0) * moves)).any()
+    assert not tilt.still(Imu(time_ns, own + np.deg2rad(3.0) * moves)).any()
 
 
 def test_a_run_that_never_rests():
     """The quietest seconds of a motion taken for rest, for want of better ones."""
     for seed in range(5):
-        imu, _ = carried(simulate.free_motion(seed, rest_s=0.0), times(100.0, 60.0))
-        assert not inclination.still(imu).any()
-        assert not inclination.still(Imu(imu.time_ns, imu.gyroscope)).any()
+        imu, _ = carried(attitude_runs.free_motion(seed, rest_s=0.0), times(100.0, 60.0))
+        assert not tilt.still(imu).any()
+        assert not tilt.still(Imu(imu.time_ns, imu.gyroscope)).any()
 
 
 @pytest.mark.parametrize("gap_s", [0.5, 5.0])
 def test_rest_over_a_gap(gap_s):
     """Rest that is lost for good where samples are missing: all of it is found again within a second."""
     imu = resting(3000)
-    t = simulate.seconds(imu.time_ns)
+    t = attitude_runs.seconds(imu.time_ns)
     there = (t < 10.0) | (t >= 10.0 + gap_s)
     there &= np.random.default_rng(0).random(len(t)) > 0.05
     kept = {key: getattr(imu, key)[there] for key in imu.per_sample}
-    found = inclination.still(Imu(imu.time_ns[there], **kept))
+    found = tilt.still(Imu(imu.time_ns[there], **kept))
     late = (t[there] > 1.2) & ((t[there] < 10.0) | (t[there] > 11.2 + gap_s))
     assert found[late].mean() > 0.95
 
@@ -226,33 +227,33 @@ def test_rest_over_a_gap(gap_s):
 def test_short_runs(count):
     """An error, or rest that nobody has seen for a second."""
     imu = resting(count)
-    found = inclination.still(imu)
+    found = tilt.still(imu)
     assert found.shape == (count,) and not found[:99].any()
     assert found[99:].all()
-    up = inclination.up_in_body(imu)
+    up = tilt.up_in_body(imu)
     expected = np.tile(MOUNT.inv().apply(UP), (count, 1))
     assert np.rad2deg(angles(up, expected).max()) < 1.0
-    assert np.isfinite(inclination.field(imu).dip).all()
+    assert np.isfinite(tilt.field(imu).dip).all()
 
 
 def test_readings_that_do_not_scatter():
     """No rest where readings repeat to the last bit, because none scatters less than the quietest: of a
     simulated sensor without noise, and of one that is rounded coarsely."""
-    assert inclination.still(resting(1000, (0.0, 0.0, 0.0)))[99:].all()
+    assert tilt.still(resting(1000, (0.0, 0.0, 0.0)))[99:].all()
     fine = resting(6000, (3e-4, 5e-3, 0.0))
     coarse = replace(
         fine,
         gyroscope=1e-3 * np.round(fine.gyroscope / 1e-3),
         accelerometer=0.02 * np.round(fine.accelerometer / 0.02),
     )
-    assert inclination.still(coarse)[99:].mean() > 0.98
+    assert tilt.still(coarse)[99:].mean() > 0.98
 
 
 def test_the_field_is_felt():
     """A dip above the horizontal, or one against the specific force of a shaken hand."""
-    imu, _ = carried(simulate.free_motion(2), times(100.0, 60.0), 2.0, (1e-3, 0.02, 0.3))
-    late = simulate.seconds(imu.time_ns) > 5.0
-    norm, dip = inclination.field(imu)
+    imu, _ = carried(attitude_runs.free_motion(2), times(100.0, 60.0), 2.0, (1e-3, 0.02, 0.3))
+    late = attitude_runs.seconds(imu.time_ns) > 5.0
+    norm, dip = tilt.field(imu)
     assert np.median(norm) == pytest.approx(48.0, abs=0.1)
     assert np.median(dip[late]) == pytest.approx(DIP, abs=np.deg2rad(0.2))
     assert np.std(dip[late]) < np.deg2rad(1.0)
@@ -262,24 +263,24 @@ def test_the_field_is_felt():
 def test_a_slower_magnetometer_spoils_no_other_sample(blank):
     """NaN that goes from samples that were not read to those that were, or zeros that stand for them taken
     for a field."""
-    imu, _ = carried(simulate.free_motion(2), times(100.0, 20.0), 2.0)
-    whole = inclination.field(imu)
+    imu, _ = carried(attitude_runs.free_motion(2), times(100.0, 20.0), 2.0)
+    whole = tilt.field(imu)
     read = np.arange(len(imu.time_ns)) % 4 == 1
     slower = np.where(read[:, None], imu.magnetometer, blank)
-    found = inclination.field(replace(imu, magnetometer=slower))
+    found = tilt.field(replace(imu, magnetometer=slower))
     for a, b in zip(found, whole, strict=True):
         np.testing.assert_array_equal(a[read], b[read])
         assert np.isnan(a[~read]).all()
     half = imu.magnetometer.copy()
     half[7, 1] = np.nan
-    found = inclination.field(replace(imu, magnetometer=half))
+    found = tilt.field(replace(imu, magnetometer=half))
     assert np.flatnonzero(np.isnan(found.dip)).tolist() == [7]
 
 
 def recording(info, imu=None):
     """A hand-held run in east, north, up."""
     if imu is None:
-        imu, _ = carried(simulate.free_motion(2), times(100.0, 30.0), 1.0)
+        imu, _ = carried(attitude_runs.free_motion(2), times(100.0, 30.0), 1.0)
     return Recording("run", imu=imu, info=info)
 
 
@@ -352,8 +353,8 @@ def test_samples_that_are_not_finite_are_left_out():
         imu = replace(imu, **{key: spoilt})
     left = earth.need_both(recording({}, imu))
     assert np.setdiff1d(imu.time_ns, left.time_ns).tolist() == imu.time_ns[[500, 600]].tolist()
-    assert np.isnan(inclination.field(left).dip).sum() == 1
-    assert inclination.still(left)[99:].mean() > 0.98
+    assert np.isnan(tilt.field(left).dip).sum() == 1
+    assert tilt.still(left)[99:].mean() > 0.98
     assert earth.setup(recording({}, imu)).field_ref[2] == pytest.approx(-np.sin(DIP), abs=0.01)
 
 
@@ -395,7 +396,7 @@ def test_thinning_of_uneven_stamps(kind):
         number = np.arange(len(time_ns))
         time_ns = time_ns[number - number % 10] + number % 10 * 50_000
     elif kind == "gaps":
-        t = simulate.seconds(time_ns)
+        t = attitude_runs.seconds(time_ns)
         time_ns = time_ns[(t < 2.0) | ((t > 9.0) & (t < 9.5)) | (t > 17.0)]
     else:
         time_ns = time_ns[np.random.default_rng(0).random(len(time_ns)) > 0.1]

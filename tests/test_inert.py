@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import scenario
 
-from jaxekf import ekf, padding, rotation, timeline
+from jaxekf.estimation import padding, timeline
+from jaxekf.filtering import ekf
+from jaxekf.geometry import rotation
 from jaxekf.models import REGISTRY
 
 NAMES = ("loose", "loose_rate", "loose_additive")

@@ -8,7 +8,8 @@ import scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxekf import ekf, timeline
+from jaxekf.estimation import timeline
+from jaxekf.filtering import ekf
 from jaxekf.models import REGISTRY
 
 NAMES = ("loose", "loose_rate", "loose_additive")

@@ -12,7 +12,8 @@ from test_contract import MODELS, data, parameters, start
 from test_naive import hidden_at_random
 from test_smoother import linear_problem
 
-from jaxekf import ekf, iterated, manifold, smoother
+from jaxekf.filtering import ekf, iterated_smoother, smoother
+from jaxekf.geometry import manifold
 
 
 def residuals_of(model, params, belief, steps, used):
@@ -71,7 +72,7 @@ def test_most_probable_path(name):
     given = data(model, 1)
     steps = jax.tree.map(jnp.asarray, hidden_at_random(given.epochs, 1))
     belief = start(model, params, given.mean)
-    function = partial(iterated.run_iterated_smoother, model, iterations=6)
+    function = partial(iterated_smoother.run_iterated_smoother, model, iterations=6)
     found = scenario.quick_jit(function)(params, belief, steps)
     assert found.moved[0] > 1e-5 and found.moved[-1] < 1e-9
     run, size = residuals_of(model, params, belief, steps, found.filtered.innovations)
@@ -102,7 +103,7 @@ def test_linear_is_the_smoother():
         values = jnp.sum(jnp.sin(found.smoothed.mean)), jnp.sum(found.smoothed.cov)
         return sum(values) + jnp.sum(found.start.mean), found
 
-    several = partial(iterated.run_iterated_smoother, iterations=2)
+    several = partial(iterated_smoother.run_iterated_smoother, iterations=2)
     (_, found), slope = scenario.quick_jit(
         jax.value_and_grad(partial(total, several), has_aux=True)
     )(belief)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxekf import jit
-from jaxekf.linalg import semidefinite_factor
+from jaxekf.geometry.linalg import semidefinite_factor
 
 factor = jit(semidefinite_factor)
 

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import get_model, jit, rotation, run_filter
-from jaxekf.model import Belief
-from jaxekf.parameters import as_arrays
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf import get_model, jit, run_filter
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.geometry import rotation
 
 DT = 0.005
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxekf import manifold, rotation
-from jaxekf.manifold import SO3, AdditiveQuaternion, Euclidean
+from jaxekf.geometry import manifold, rotation
+from jaxekf.geometry.manifold import SO3, AdditiveQuaternion, Euclidean
 
 
 class Pose(NamedTuple):

@@ -3,8 +3,8 @@
 import numpy as np
 
 import jaxekf
-from jaxekf import timeline
-from jaxekf.recording import Imu, Recording
+from jaxekf.estimation import timeline
+from jaxekf.recordings.types import Imu, Recording
 
 HERTZ, ROWS = 400.0, 1000
 LATE = 6

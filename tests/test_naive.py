@@ -13,10 +13,10 @@ import scenario
 import toy_models
 from test_contract import MODELS, data, masked, parameters, start
 
-from jaxekf import ekf
-from jaxekf.errors import ModelError
-from jaxekf.model import Belief
-from jaxekf.timeline import Rows, Steps
+from jaxekf._support.errors import ModelError
+from jaxekf.filtering import ekf
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Rows, Steps
 
 
 def hidden_at_random(steps, seed):
@@ -186,7 +186,7 @@ WHOLE = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::jaxekf.errors.SlowModelWarning")
+@pytest.mark.filterwarnings("ignore::jaxekf._support.errors.SlowModelWarning")
 @pytest.mark.parametrize("where", ["transition", "sensor"])
 @pytest.mark.parametrize("name", WHOLE)
 def test_parameters_inside_whole_operations(name, where):

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxekf import simulate
-from jaxekf.alignment import align
-from jaxekf.errors import RecordingError
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration.alignment import align
+from jaxekf.simulation import attitude_runs
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 MINUTES = 10.0 if LONG else 2.0
@@ -25,12 +25,12 @@ def planted(seed):
     hidden = [
         (t, t + rng.uniform(0.2, 3.0)) for t in rng.uniform(0.0, duration, int(duration / 20))
     ]
-    run = simulate.recording(
+    run = attitude_runs.recording(
         "run",
-        simulate.free_motion(seed),
+        attitude_runs.free_motion(seed),
         seed=seed,
         duration_s=duration,
-        grade=simulate.SensorGrade(gyroscope_deg=0.1),
+        grade=attitude_runs.SensorGrade(gyroscope_deg=0.1),
         occlusions=hidden,
         dropouts=0.02,
     )
@@ -62,11 +62,11 @@ def unexcited(seed):
     rate = np.zeros(3)
     if seed % 2:
         rate[seed % 3] = np.deg2rad(rng.uniform(1.0, 15.0)) * rng.choice([-1.0, 1.0])
-    grade = simulate.SensorGrade(
+    grade = attitude_runs.SensorGrade(
         gyroscope_deg=10 ** rng.uniform(-2.0, 0.0), optical_deg=10 ** rng.uniform(-2.0, 0.0)
     )
-    motion = simulate.Motion(rate=(float(rate[0]), float(rate[1]), float(rate[2])))
-    return simulate.recording("run", motion, seed=seed, duration_s=60.0, grade=grade)
+    motion = attitude_runs.Motion(rate=(float(rate[0]), float(rate[1]), float(rate[2])))
+    return attitude_runs.recording("run", motion, seed=seed, duration_s=60.0, grade=grade)
 
 
 @pytest.mark.parametrize("seed", range(50) if LONG else range(3))

@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxekf import ekf, robust, rotation
-from jaxekf.errors import SlowModelWarning
-from jaxekf.interpolation import InputSample
-from jaxekf.manifold import SO3
-from jaxekf.model import Belief, Model, Parameters, Sensor
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf import robust
+from jaxekf._support.errors import SlowModelWarning
+from jaxekf.filtering import ekf
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.geometry import rotation
+from jaxekf.geometry.manifold import SO3
 
 RUNS, EPOCHS = 16, 32
 LIMITS = {"loose": 8_000, "tight": 15_000, "marg": 18_000, "visual": 25_000}

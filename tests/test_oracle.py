@@ -10,11 +10,11 @@ import toy_models
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from jaxekf import linearise
-from jaxekf.interpolation import InputSample
-from jaxekf.model import Belief
+from jaxekf.filtering import _linearisation as linearisation
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Rows, Steps
 from jaxekf.models import REGISTRY
-from jaxekf.timeline import Rows, Steps
 
 NAMES = ("loose", "loose_rate", "loose_additive")
 
@@ -160,7 +160,7 @@ def added_noise(model, params, dt):
     q = jnp.array([1.0, 0.0, 0.0, 0.0])
     x = model.space._make([q] + [zero] * (len(model.space) - 1))
     u = InputSample(zero, zero, jnp.zeros(()))
-    _, f, g = linearise.linearise_transition(model, params, x, u, dt)
+    _, f, g = linearisation.linearise_transition(model, params, x, u, dt)
     return f, g @ model.process_noise(params, dt) @ g.T
 
 

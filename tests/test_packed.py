@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 import jaxekf
-from jaxekf.packed import packed
+from jaxekf.filtering.lowering.packed import packed
 
 
 def test_a_scan_over_packed_arrays_is_the_scan():

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxekf import plausible, simulate, simulate_tool
-from jaxekf.datasets import asl, broad
-from jaxekf.errors import RecordingError
-from jaxekf.pose import from_markers
-from jaxekf.recording import Imu, Optical, Recording, from_scipy, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.checks import plausibility
+from jaxekf.io.importers import asl, broad
+from jaxekf.pose_solvers.marker_pose import from_markers
+from jaxekf.recordings.types import Imu, Optical, Recording, from_scipy, to_scipy
+from jaxekf.simulation import attitude_runs, marker_runs
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
@@ -20,9 +21,9 @@ DEGREES = np.rad2deg(1.0)
 
 def tool_pose(seed, size=1.0):
     """Poses of a moved tool, an accelerometer, and a tracked frame that lies 60 deg turned in the IMU's."""
-    motion = simulate_tool.free_tool_motion(seed)
+    motion = marker_runs.free_tool_motion(seed)
     motion = replace(motion, amplitude=size * motion.amplitude)
-    run = simulate_tool.tool_recording("run", motion, seed=seed, duration_s=30.0)
+    run = marker_runs.tool_recording("run", motion, seed=seed, duration_s=30.0)
     pose = from_markers(run.markers)
     turn = Rotation.from_rotvec(np.deg2rad([20.0, 0.0, 56.0]))
     q = from_scipy(to_scipy(pose.q_ref_body) * turn)
@@ -106,21 +107,21 @@ def test_what_is_contradicted_is_named(fault):
     make, message = FAULTS[fault]
     for seed in range(6 if LONG else 2):
         run = tool_pose(seed)
-        plausible.require(run)
-        plausible.require(rough(run, seed))
+        plausibility.require(run)
+        plausibility.require(rough(run, seed))
         for wrong in (make(run), make(rough(run, seed))):
             with pytest.raises(RecordingError, match=message):
-                plausible.require(wrong)
+                plausibility.require(wrong)
 
 
 def test_the_likelier_reading_is_named_first():
     """Of order and direction, which turns alone do not part, the one that turns axes for nothing."""
-    run = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=30.0)
-    plausible.require(run)
+    run = attitude_runs.recording("run", attitude_runs.free_motion(1), seed=1, duration_s=30.0)
+    plausibility.require(run)
     for fault in ("scalar last", "scalar first", "conjugate"):
         make, message = FAULTS[fault]
         with pytest.raises(RecordingError, match=r"\[optical\] " + message + " or quaternion"):
-            plausible.require(make(run))
+            plausibility.require(make(run))
 
 
 @pytest.mark.parametrize("said", ["w,x,y,z,reference to body", "reference to body"])
@@ -128,24 +129,24 @@ def test_advice_says_order_and_direction_however_they_were_written(said):
     """Would catch advice that leaves a word of what was stated in the order's place."""
     run = tool_pose(1)
     with pytest.raises(RecordingError, match='quaternion = "w,x,y,z, body to reference"'):
-        plausible.require(
+        plausibility.require(
             stated(run, said).replace(optical=turned(run, lambda q: q * CONJUGATE).optical)
         )
 
 
 def test_markers_in_millimetres():
     """A geometry that is called another tool's where only the unit is another."""
-    motion = simulate_tool.free_tool_motion(1)
-    run = simulate_tool.tool_recording("run", motion, seed=1, duration_s=10.0)
-    plausible.require(run)
-    found = plausible.evidence(run)
+    motion = marker_runs.free_tool_motion(1)
+    run = marker_runs.tool_recording("run", motion, seed=1, duration_s=10.0)
+    plausibility.require(run)
+    found = plausibility.evidence(run)
     assert found.explained > 0.95 and 0.95 < found.rate_ratio < 1.05
     for factor, message in ((1e3, r'1000 times.*\[markers\] unit = "mm"'), (1e-3, "geometry")):
         markers = replace(run.markers, position=factor * run.markers.position)
         with pytest.raises(RecordingError, match=message):
-            plausible.require(run.replace(markers=markers))
+            plausibility.require(run.replace(markers=markers))
     with pytest.raises(RecordingError, match=r'57.*"deg/s, m/s'):
-        plausible.require(scaled(run, rate=DEGREES))
+        plausibility.require(scaled(run, rate=DEGREES))
 
 
 def test_the_file_and_entry_are_named(tmp_path):
@@ -153,17 +154,17 @@ def test_the_file_and_entry_are_named(tmp_path):
     run = FAULTS["deg/s"][0](tool_pose(0))
     (tmp_path / "recording.toml").write_text("schema_version = 1\n")
     with pytest.raises(RecordingError, match=r"recording.toml:imu\.unit: got") as caught:
-        plausible.require(run.replace(path=tmp_path))
+        plausibility.require(run.replace(path=tmp_path))
     assert caught.value.column == "imu.unit"
 
 
 def weak_motions():
     """What tells little or nothing: rest, slow and constant turns, turns about one axis."""
-    yield simulate.Motion()
-    yield simulate.Motion(rate=(0.01, 0.0, -0.02))
-    yield simulate.constant_rate_motion(rest_s=5.0)
-    yield simulate.free_motion(3, speed_deg=2.0)
-    one = simulate.free_motion(4)
+    yield attitude_runs.Motion()
+    yield attitude_runs.Motion(rate=(0.01, 0.0, -0.02))
+    yield attitude_runs.constant_rate_motion(rest_s=5.0)
+    yield attitude_runs.free_motion(3, speed_deg=2.0)
+    one = attitude_runs.free_motion(4)
     yield replace(one, amplitude=one.amplitude * np.array([[1.0], [0.0], [0.0]]))
 
 
@@ -172,24 +173,26 @@ def test_no_false_alarm_of_weak_motion(seed):
     """An alarm where nothing is told, or an answer made up from noise."""
     rng = np.random.default_rng(seed)
     for motion in weak_motions():
-        grade = simulate.SensorGrade(
+        grade = attitude_runs.SensorGrade(
             gyroscope_deg=10 ** rng.uniform(-2, 0),
             bias_deg=3.0,
             optical_deg=10 ** rng.uniform(-2, 0),
         )
-        run = simulate.recording("run", motion, seed=seed, duration_s=20.0, grade=grade)
-        plausible.require(run)
-        plausible.require(rough(run, seed))
-    rest = simulate.recording("run", simulate.Motion(), seed=seed, duration_s=20.0)
-    assert np.isnan(plausible.evidence(rest).rate_ratio)
-    plausible.require(tool_pose(seed, size=0.0))
+        run = attitude_runs.recording("run", motion, seed=seed, duration_s=20.0, grade=grade)
+        plausibility.require(run)
+        plausibility.require(rough(run, seed))
+    rest = attitude_runs.recording("run", attitude_runs.Motion(), seed=seed, duration_s=20.0)
+    assert np.isnan(plausibility.evidence(rest).rate_ratio)
+    plausibility.require(tool_pose(seed, size=0.0))
 
 
 def test_one_axis_does_not_tell_the_order():
     """An order made up where turns about one axis fit every reading."""
-    run = simulate.recording("run", simulate.constant_rate_motion(), seed=0, duration_s=30.0)
-    plausible.require(turned(run, lambda q: q * CONJUGATE))
-    assert plausible.evidence(run).second_axis < 0.05
+    run = attitude_runs.recording(
+        "run", attitude_runs.constant_rate_motion(), seed=0, duration_s=30.0
+    )
+    plausibility.require(turned(run, lambda q: q * CONJUGATE))
+    assert plausibility.evidence(run).second_axis < 0.05
 
 
 def test_one_axis_does_not_tell_where_gravity_is():
@@ -211,9 +214,9 @@ def test_one_axis_does_not_tell_where_gravity_is():
         imu=Imu(time_ns, gyroscope, force),
         info={"gravity_ref": [0.0, 0.0, -9.81]},
     )
-    found = plausible.evidence(spindle)
+    found = plausibility.evidence(spindle)
     assert found.explained > 0.95 and found.mean_force > 5.0
-    plausible.require(spindle)
+    plausibility.require(spindle)
 
 
 def test_gravity_the_other_way_round():
@@ -224,7 +227,7 @@ def test_gravity_the_other_way_round():
     fall = np.asarray(run.info["gravity_ref"])
 
     def require(gravity):
-        plausible.require(run.replace(info={**run.info, "gravity_ref": list(gravity)}))
+        plausibility.require(run.replace(info={**run.info, "gravity_ref": list(gravity)}))
 
     require(fall)
     require(Rotation.from_rotvec([0.3, 0.0, 0.0]).apply(fall))
@@ -238,7 +241,7 @@ def test_gravity_the_other_way_round():
     )
     for size, said in ((1.0 / 9.80665, "free fall of 1 m/s"), (1e3, "free fall of 9.8")):
         with pytest.raises(RecordingError, match=f"{said}.*about 9.8"):
-            plausible.require(still.replace(info={"gravity_ref": list(size * fall)}))
+            plausibility.require(still.replace(info={"gravity_ref": list(size * fall)}))
 
 
 def test_what_is_missing_is_not_judged():
@@ -255,8 +258,8 @@ def test_what_is_missing_is_not_judged():
         run.replace(optical=hidden),
         run.replace(imu=replace(force, time_ns=force.time_ns[:1], gyroscope=force.gyroscope[:1])),
     ):
-        plausible.require(less)
-        assert plausible.evidence(less).as_dict()["explained"] is not None
+        plausibility.require(less)
+        assert plausibility.evidence(less).as_dict()["explained"] is not None
 
 
 def real_runs(data_dir):
@@ -273,12 +276,12 @@ def real_runs(data_dir):
 def test_real_runs(data_dir):
     """False alarms on real recordings, or a wrong order in them that passes."""
     for i, run in enumerate(real_runs(data_dir)):
-        found = plausible.evidence(run)
-        plausible.check(run, found)
+        found = plausibility.evidence(run)
+        plausibility.check(run, found)
         assert found.explained > 0.95 and abs(found.rate_ratio - 1.0) < 0.01
         assert abs(found.static_norm - 9.81) < 0.15
-        plausible.require(rough(run, i))
+        plausibility.require(rough(run, i))
         for fault in ("scalar last", "scalar first", "conjugate", "deg/s", "rad/s", "g", "mm", "m"):
             make, message = FAULTS[fault]
             with pytest.raises(RecordingError, match=message):
-                plausible.require(make(run))
+                plausibility.require(make(run))

@@ -3,8 +3,8 @@
 import pytest
 
 import jaxekf
-from jaxekf import plots
-from jaxekf.datasets import demo
+from jaxekf.reporting import plots
+from jaxekf.simulation import demo
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 import jaxekf
-from jaxekf import plots, pose, simulate_tool
-from jaxekf.plots import attitudes, sight, single_markers
-from jaxekf.recording import Encoder, Optical
-from jaxekf.simulate_tool import ToolGrade
-from jaxekf.truth import encoder_velocity_at
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.truth import encoder_velocity_at
+from jaxekf.recordings.types import Encoder, Optical
+from jaxekf.reporting import plots
+from jaxekf.reporting.plots import _attitudes as attitudes
+from jaxekf.reporting.plots import _sight as sight
+from jaxekf.reporting.plots import _single_markers as single_markers
+from jaxekf.simulation import marker_runs
+from jaxekf.simulation.marker_runs import ToolGrade
 
 NAMES = (
     "attitude",
@@ -31,9 +35,9 @@ REFUSED = (20, 40, 60)
 @pytest.fixture(scope="module")
 def made():
     """3 s: from 1.5 s on marker 3 is hidden, from 2 s on all, until 2.25 s."""
-    recording = simulate_tool.tool_recording(
+    recording = marker_runs.tool_recording(
         "tool",
-        simulate_tool.free_tool_motion(2),
+        marker_runs.free_tool_motion(2),
         seed=2,
         duration_s=3.0,
         grade=ToolGrade(imu_s=0.006),
@@ -109,7 +113,7 @@ def test_what_is_missing_is_left_out(made, tmp_path):
     """Would catch limits that are not numbers: of a tracker's pose without position, of a marker that was
     never seen, of an encoder without positions."""
     estimate, recording = made
-    raw = pose.from_markers(recording.markers)
+    raw = marker_pose.from_markers(recording.markers)
     tracker = replace(raw, position=np.full_like(raw.position, np.nan))
     encoder = replace(recording.encoder, position=None)
     never = estimate.sensors["marker_2"]

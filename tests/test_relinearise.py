@@ -10,11 +10,12 @@ import pytest
 import scenario
 import toy_models
 
-from jaxekf import ekf, manifold, rotation
-from jaxekf.errors import ModelError
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Belief
-from jaxekf.timeline import Rows, Steps
+from jaxekf._support.errors import ModelError
+from jaxekf.filtering import ekf
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Rows, Steps
+from jaxekf.geometry import manifold, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
 
 PRIOR, SPREAD, NOISE = 1.0, 0.5, 0.1
 

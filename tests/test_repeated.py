@@ -9,11 +9,11 @@ import pytest
 import scenario
 import toy_models
 
-from jaxekf import ekf, iterated, smoother
-from jaxekf.errors import ModelError
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Sensor, repeated
-from jaxekf.timeline import Rows
+from jaxekf._support.errors import ModelError
+from jaxekf.filtering import ekf, iterated_smoother, smoother
+from jaxekf.filtering.model import Sensor, repeated
+from jaxekf.filtering.steps import Rows
+from jaxekf.geometry.manifold import SO3, Euclidean
 
 
 def correlated(params, aux, dt):
@@ -99,7 +99,9 @@ def test_the_iterated_smoother_takes_groups():
 
     def found(model):
         def run(params):
-            return iterated.run_iterated_smoother(model, params, belief, steps, iterations=2)
+            return iterated_smoother.run_iterated_smoother(
+                model, params, belief, steps, iterations=2
+            )
 
         return scenario.quick_jit(run)(model.parameters)
 

@@ -14,12 +14,15 @@ from click.testing import CliRunner
 
 import jaxekf
 from jaxekf.cli import main
-from jaxekf.datasets import demo
-from jaxekf.recording import Encoder, Recording
-from jaxekf.report import consistency, figures, thinning, write_report
-from jaxekf.report.evidence import gather
-from jaxekf.report.saved import read_result
-from jaxekf.result import OutputEstimate
+from jaxekf.estimation.result import OutputEstimate
+from jaxekf.recordings.types import Encoder, Recording
+from jaxekf.reporting.report import _consistency as consistency
+from jaxekf.reporting.report import _figures as figures
+from jaxekf.reporting.report import _thinning as thinning
+from jaxekf.reporting.report import write_report
+from jaxekf.reporting.report._evidence import gather
+from jaxekf.reporting.report._saved import read_result
+from jaxekf.simulation import demo
 
 NAME = 'free <b>&"5"'
 NOTE = 'a note </script><script>throw 1</script> & "so on"'

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxekf.cli import main
-from jaxekf.datasets import demo
+from jaxekf.simulation import demo
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 BROWSER = next(filter(None, map(shutil.which, NAMES)), None)

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 import jaxekf
-from jaxekf import tables
+from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.cli import main
-from jaxekf.datasets import demo
-from jaxekf.errors import ModelError, RecordingError
-from jaxekf.simulate_tool import ToolGrade, free_tool_motion, tool_recording
+from jaxekf.io import csv_table
+from jaxekf.simulation import demo
+from jaxekf.simulation.marker_runs import ToolGrade, free_tool_motion, tool_recording
 
 RUN = demo.FOLDER / "free-5"
 
@@ -154,20 +154,20 @@ def test_command_line(tmp_path):
     times = [jaxekf.load(run).need_encoder().time_ns[200:205] + 123 for run in runs]
     asked = tmp_path / "asked.csv"
     values = np.full((5, 1), 3.0)
-    tables.write_csv(asked, ["angle"], times[1], values, 9)
+    csv_table.write_csv(asked, ["angle"], times[1], values, 9)
     arguments = ("--at", asked, "--export", "tum", "--json")
     result = call("estimate", runs[1], "-o", tmp_path / "one", *arguments)
     assert result.exit_code == 0, result.output
     folder = tmp_path / "one" / names[1]
     made = jaxekf.estimate(runs[1], at=times[1])
-    table = tables.read_table(folder / "requested.csv")
-    np.testing.assert_array_equal(tables.read_times(table), times[1])
-    found = tables.finite_numbers(table, ("q_ref_body_w", "bias_z"))
+    table = csv_table.read_table(folder / "requested.csv")
+    np.testing.assert_array_equal(csv_table.read_times(table), times[1])
+    found = csv_table.finite_numbers(table, ("q_ref_body_w", "bias_z"))
     np.testing.assert_allclose(found[:, 0], made.requested.state.q_ref_body[:, 0], atol=1e-11)
     np.testing.assert_allclose(found[:, 1], made.requested.bias.value[:, 2], rtol=1e-11)
     lines = (folder / "trajectory.tum").read_text("utf-8").splitlines()
     assert sum(not line.startswith("#") for line in lines) == 5
-    whole = tables.read_table(folder / "estimate.csv")
+    whole = csv_table.read_table(folder / "estimate.csv")
     assert len(whole) == len(made.time_ns)
     assert json.loads((folder / "result.json").read_text("utf-8"))["requested"] == 5
     result = call("estimate", *runs, "-o", tmp_path / "two", "--every", 0.01, "--json")
@@ -176,7 +176,7 @@ def test_command_line(tmp_path):
     assert pooled["runs"] == list(names)
     assert "all 2 runs together: " in result.stderr
     for name in names:
-        grid = tables.read_times(tables.read_table(tmp_path / "two" / name / "requested.csv"))
+        grid = csv_table.read_times(csv_table.read_table(tmp_path / "two" / name / "requested.csv"))
         assert set(np.diff(grid)) == {10_000_000}
     for options, words in (
         (("--every", 0.1, "--at", asked), "got --at and --every"),

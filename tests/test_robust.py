@@ -13,10 +13,13 @@ import test_consistency as honest
 import toy_models
 
 import jaxekf
-from jaxekf import ekf, jit, manifold, rotation, simulate, smoother
-from jaxekf.errors import ModelError
-from jaxekf.model import Belief
-from jaxekf.timeline import Rows, Steps
+from jaxekf import jit
+from jaxekf._support.errors import ModelError
+from jaxekf.filtering import ekf, smoother
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Rows, Steps
+from jaxekf.geometry import manifold, rotation
+from jaxekf.simulation import attitude_runs
 
 RUNS = 100
 EPOCHS = 1000
@@ -96,7 +99,7 @@ def errors(model, drawn_from, params, steps, keys, share):
         cov = drawn_from.initial_covariance(params)
         error = jnp.linalg.cholesky(cov) @ jax.random.normal(first, cov.shape[:1])
         true = manifold.retract(drawn_from.space, mean, error)
-        truth, drawn = simulate.draw(drawn_from, params, true, steps, second)
+        truth, drawn = attitude_runs.draw(drawn_from, params, true, steps, second)
         rows = drawn.slow["optical"]
         way = jax.random.normal(third, (rows.mask.shape[0], 3))
         way = way / jnp.linalg.norm(way, axis=1, keepdims=True)
@@ -194,7 +197,7 @@ def test_what_a_result_tells(tmp_path):
     wrong = run.optical.q_ref_body.copy()
     wrong[100:1400:100] = scenario.from_scipy(
         scenario.Rotation.from_rotvec([0.0, 0.0, 0.5])
-        * jaxekf.recording.to_scipy(wrong[100:1400:100])
+        * jaxekf.recordings.types.to_scipy(wrong[100:1400:100])
     )
     spoilt = run.replace(optical=dataclasses.replace(run.optical, q_ref_body=wrong))
     made = jaxekf.estimate(spoilt, jaxekf.robust("loose", "student"))

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import jaxekf
-from jaxekf import encoder_storage, intake, simulate
-from jaxekf.datasets import ros
-from jaxekf.errors import RecordingError
-from jaxekf.recording import to_scipy
-from jaxekf.rows import Place
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _encoder as encoder
+from jaxekf.io.importers import ros
+from jaxekf.recordings import screening
+from jaxekf.recordings.accounts import Place
+from jaxekf.recordings.types import to_scipy
+from jaxekf.simulation import attitude_runs
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
@@ -105,8 +107,8 @@ def write(folder, kind, topics, make=None):
 
 @pytest.fixture(scope="module")
 def run():
-    motion = simulate.constant_rate_motion(rest_s=0.3)
-    record = simulate.recording(
+    motion = attitude_runs.constant_rate_motion(rest_s=0.3)
+    record = attitude_runs.recording(
         "run", motion, seed=1, duration_s=1.0, start_ns=START, occlusions=[(0.5, 0.6)]
     )
     force = np.random.default_rng(3).normal(size=record.imu.gyroscope.shape)
@@ -153,14 +155,14 @@ def test_round_trip(run, tmp_path, kind):
     np.testing.assert_array_equal(again.imu.accelerometer, run.imu.accelerometer)
     o = run.optical
     # Quaternions are scaled to unit norm as of every source.
-    expected, _ = intake.optical(Place("run"), o.time_ns, o.q_ref_body, o.position)
+    expected, _ = screening.optical(Place("run"), o.time_ns, o.q_ref_body, o.position)
     np.testing.assert_array_equal(again.optical.time_ns, o.time_ns)
     np.testing.assert_array_equal(again.optical.valid, o.valid)
     np.testing.assert_array_equal(again.optical.q_ref_body[o.valid], expected.q_ref_body[o.valid])
     np.testing.assert_array_equal(again.optical.position, o.position)
     np.testing.assert_array_equal(again.encoder.time_ns, run.encoder.time_ns)
-    q = encoder_storage.joint_attitude(angles(run), {"axis": [1.0, 0.0, 0.0]}, "run")
-    turned, _ = intake.encoder(Place("run"), run.encoder.time_ns, q)
+    q = encoder.joint_attitude(angles(run), {"axis": [1.0, 0.0, 0.0]}, "run")
+    turned, _ = screening.encoder(Place("run"), run.encoder.time_ns, q)
     np.testing.assert_array_equal(again.encoder.q_ref_body, turned.q_ref_body)
     np.testing.assert_allclose(turned.q_ref_body, run.encoder.q_ref_body, atol=1e-15)
     account = again.intake["optical"]

@@ -8,7 +8,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxekf import rotation
+from jaxekf.geometry import rotation
 
 EXACT = 1e-14
 product = jax.jit(rotation.product)

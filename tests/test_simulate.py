@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import simulate
-from jaxekf.datasets import demo
-from jaxekf.metrics import attitude_error
+from jaxekf.evaluation.metrics import attitude_error
+from jaxekf.simulation import attitude_runs, demo
 
 
 @pytest.mark.parametrize(
-    "motion", [simulate.constant_rate_motion(rest_s=1.0), simulate.free_motion(5)]
+    "motion", [attitude_runs.constant_rate_motion(rest_s=1.0), attitude_runs.free_motion(5)]
 )
 def test_rate_is_the_derivative_of_the_attitude(motion):
     """Would catch a rate in the wrong frame, or a jump in the attitude."""
@@ -28,17 +27,19 @@ def test_rate_is_the_derivative_of_the_attitude(motion):
 
 def test_motion_rests_first():
     """Would catch a run whose bias cannot be measured at rest."""
-    q, rate = simulate.constant_rate_motion(-9.0, 3.0).attitude(np.linspace(0.0, 2.99, 50))
+    q, rate = attitude_runs.constant_rate_motion(-9.0, 3.0).attitude(np.linspace(0.0, 2.99, 50))
     assert np.all(rate == 0.0)
     assert np.all(q == q[0])
-    _, rate = simulate.constant_rate_motion(-9.0, 3.0).attitude(np.array([5.0]))
+    _, rate = attitude_runs.constant_rate_motion(-9.0, 3.0).attitude(np.array([5.0]))
     np.testing.assert_allclose(np.rad2deg(rate), [[-9.0, 0.0, 0.0]], atol=1e-12)
 
 
 def test_noise_is_as_large_as_asked():
     """Would catch a density taken for a deviation: 0.05 deg/s/sqrt(Hz) is 0.56 deg/s at 125 Hz."""
-    grade = simulate.SensorGrade(bias_deg=0.0, bias_walk_deg=0.0)
-    record = simulate.recording("run", simulate.Motion(), seed=4, duration_s=200.0, grade=grade)
+    grade = attitude_runs.SensorGrade(bias_deg=0.0, bias_walk_deg=0.0)
+    record = attitude_runs.recording(
+        "run", attitude_runs.Motion(), seed=4, duration_s=200.0, grade=grade
+    )
     white = np.rad2deg(record.need_imu().gyroscope.std())
     assert white == pytest.approx(0.05 * np.sqrt(125.0), rel=0.02)
     optical, encoder = record.need_optical(), record.need_encoder()
@@ -50,8 +51,13 @@ def test_noise_is_as_large_as_asked():
 
 def test_occlusions_and_dropouts():
     """Would catch a tracker that sees through an occlusion, or rows that vanish instead of being hidden."""
-    record = simulate.recording(
-        "run", simulate.Motion(), seed=1, duration_s=60.0, occlusions=[(20.0, 21.0)], dropouts=0.1
+    record = attitude_runs.recording(
+        "run",
+        attitude_runs.Motion(),
+        seed=1,
+        duration_s=60.0,
+        occlusions=[(20.0, 21.0)],
+        dropouts=0.1,
     )
     optical = record.need_optical()
     t = (optical.time_ns - optical.time_ns[0]) / 1e9
@@ -64,7 +70,7 @@ def test_occlusions_and_dropouts():
 def test_seeds_are_explicit():
     """Would catch a hidden global seed."""
     one, same, other = (
-        simulate.recording("run", simulate.free_motion(1), seed=s, duration_s=1.0)
+        attitude_runs.recording("run", attitude_runs.free_motion(1), seed=s, duration_s=1.0)
         for s in (1, 1, 2)
     )
     np.testing.assert_array_equal(one.imu.gyroscope, same.imu.gyroscope)

@@ -12,9 +12,9 @@ import toy_models
 from test_contract import MODELS, data, parameters, start
 from test_naive import hidden_at_random
 
-from jaxekf import smoother
-from jaxekf.model import Belief
-from jaxekf.timeline import Rows, Steps
+from jaxekf.filtering import smoother
+from jaxekf.filtering.model import Belief
+from jaxekf.filtering.steps import Rows, Steps
 
 
 def linear_problem(seed, size=4, epochs=40):

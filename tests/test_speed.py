@@ -9,26 +9,16 @@ import pytest
 import scenario
 
 import tuning
-from jaxekf import (
-    blocks,
-    ekf,
-    estimate_many,
-    estimation,
-    jit,
-    lanes,
-    padding,
-    patterned,
-    programs,
-    recursion,
-    run_filter,
-    simulate,
-    structure,
-    timeline,
-)
-from jaxekf.errors import ModelError
-from jaxekf.model import Belief
+from jaxekf import estimate_many, jit, run_filter
+from jaxekf._support.errors import ModelError
+from jaxekf.estimation import batch, padding, timeline
+from jaxekf.filtering import _recursion as recursion
+from jaxekf.filtering import ekf
+from jaxekf.filtering.lowering import blocks, lanes, scalar_graph, sparsity, structured_matrix
+from jaxekf.filtering.model import Belief
 from jaxekf.models import get_model
-from tuning import descent
+from jaxekf.simulation import attitude_runs
+from tuning.search import descent
 
 
 def test_structure_is_found_where_it_is():
@@ -41,19 +31,19 @@ def test_structure_is_found_where_it_is():
         first = jnp.concatenate([x[:1], jnp.ones(2)])
         return matrix * first[:, None] + jnp.zeros((3, 3)) * x[None]
 
-    found = structure.find(programs.trace(function, x))
+    found = sparsity.find(scalar_graph.trace(function, x))
     expected = np.array([[False, True, False], [True] * 3, [True] * 3])
     np.testing.assert_array_equal(found.known, expected)
     np.testing.assert_array_equal(found.value[1:], [[0, 0, 1], [0, 1, 0]])
-    form = patterned.pattern(found)
+    form = structured_matrix.pattern(found)
     assert form.bands == (((0,), (0, 2)),)
 
 
 def test_what_is_not_understood_is_not_called_known():
     """An operation without a rule that is taken for constant."""
-    opaque = structure.find(programs.trace(lambda x: jnp.sort(x) * 1.0, jnp.ones(3)))
+    opaque = sparsity.find(scalar_graph.trace(lambda x: jnp.sort(x) * 1.0, jnp.ones(3)))
     assert not opaque.known.any()
-    mixed = structure.find(programs.trace(lambda x: jnp.sort(x.at[1:].set(0.0)), jnp.ones(3)))
+    mixed = sparsity.find(scalar_graph.trace(lambda x: jnp.sort(x.at[1:].set(0.0)), jnp.ones(3)))
     assert not mixed.known.any()
 
 
@@ -75,15 +65,15 @@ def test_values_on_lanes_are_those_of_the_function(name):
     }
     rng = np.random.default_rng(0)
     x, m = rng.normal(size=(5, 3)), np.eye(3) + 0.1 * rng.normal(size=(5, 3, 3))
-    program = programs.trace(functions[name], x[0], m[0])
+    program = scalar_graph.trace(functions[name], x[0], m[0])
     values = [jnp.moveaxis(jnp.asarray(a), 0, -1) for a in (x, m)]
-    found = jnp.moveaxis(lanes.evaluate(structure.simplified(program), values), -1, 0)
+    found = jnp.moveaxis(lanes.evaluate(sparsity.simplified(program), values), -1, 0)
     np.testing.assert_allclose(found, jax.vmap(functions[name])(x, m), rtol=1e-13, atol=1e-14)
 
 
 def moving(name, seed, seconds=1.0):
-    motion = simulate.free_motion(seed, speed_deg=60.0, rest_s=0.1)
-    return simulate.recording(name, motion, seed=seed, duration_s=seconds)
+    motion = attitude_runs.free_motion(seed, speed_deg=60.0, rest_s=0.1)
+    return attitude_runs.recording(name, motion, seed=seed, duration_s=seconds)
 
 
 def problem(model, seed):
@@ -263,12 +253,12 @@ def test_runs_of_many_lengths_compile_few_programs():
     lines = timeline.build_many(get_model("loose"), runs)
     buckets = len(padding.groups(lines))
     assert buckets < len(runs)
-    estimation._run.clear_cache()
+    batch._run.clear_cache()
     found = estimate_many(runs, "loose")
-    assert estimation._run._cache_size() <= buckets
-    compiled = estimation._run._cache_size()
+    assert batch._run._cache_size() <= buckets
+    compiled = batch._run._cache_size()
     estimate_many(runs, "loose")
-    assert estimation._run._cache_size() == compiled
+    assert batch._run._cache_size() == compiled
     model = get_model("loose")
     params = jax.tree.map(jnp.asarray, model.parameters)
     for i in (0, 4):
@@ -288,7 +278,7 @@ def test_a_batch_larger_than_memory(monkeypatch):
     """Runs lost or mixed up where a group is taken in several batches, the last one filled."""
     runs = [moving(f"run{i}", i) for i in range(3)]
     expected = estimate_many(runs, "loose")
-    monkeypatch.setattr(estimation, "_BATCH_BYTES", 1)
+    monkeypatch.setattr(batch, "_BATCH_BYTES", 1)
     found = estimate_many(runs, "loose")
     for a, b in zip(found, expected, strict=True):
         assert a.run == b.run

@@ -8,16 +8,17 @@ import pytest
 
 import jaxekf
 import tuning
-from jaxekf import simulate
-from jaxekf.errors import TuningError
-from jaxekf.parameters import as_arrays
-from tuning import batches, resume
-from tuning import starts as starting
-from tuning.batches import Batches, cut
-from tuning.data import prepare_groups
-from tuning.descent import Best, Descent, Iteration
-from tuning.frame import no_correction
-from tuning.noise import layout
+from jaxekf._support.errors import TuningError
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.simulation import attitude_runs
+from tuning.objective.data import prepare_groups
+from tuning.parametrisation.free_vector import layout
+from tuning.parametrisation.truth_frame import no_correction
+from tuning.persistence import checkpoint
+from tuning.search import _minibatch as minibatch
+from tuning.search import multistart as starting
+from tuning.search._minibatch import Batches, cut
+from tuning.search.descent import Best, Descent, Iteration
 
 OPTIONS: dict[str, Any] = {"objective": "likelihood", "free": ["noise"], "iterations": 40}
 MODEL = jaxekf.get_model("loose")
@@ -27,7 +28,9 @@ MODEL = jaxekf.get_model("loose")
 def runs():
     """Three short runs; the start that all tests have is far off."""
     return [
-        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=6.0)
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i, rest_s=0.2), seed=i, duration_s=6.0
+        )
         for i in range(3)
     ]
 
@@ -200,7 +203,7 @@ def test_goes_on_after_a_stop(how, runs, start, race, tmp_path):
 def test_goes_on_after_a_stop_in_the_warm_steps(after, runs, start, tmp_path, monkeypatch):
     """Would catch warm steps that begin anew after a stop in the middle of them, or right after them."""
     options: dict[str, Any] = {**OPTIONS, "start": start, "warm": True, "iterations": 2}
-    steps, write = [], resume.write
+    steps, write = [], checkpoint.write
 
     def stopping(*given):
         write(*given)
@@ -208,7 +211,7 @@ def test_goes_on_after_a_stop_in_the_warm_steps(after, runs, start, tmp_path, mo
         if len(steps) == after:
             raise Stop
 
-    monkeypatch.setattr(resume, "write", stopping)
+    monkeypatch.setattr(checkpoint, "write", stopping)
     state = tmp_path / "state.npz"
     with pytest.raises(Stop):
         tuning.tune(runs, checkpoint=state, **options)
@@ -261,7 +264,7 @@ def test_goes_on_in_the_middle_of_a_pass(runs, start, monkeypatch):
     given = MODEL, tuning.innovation_likelihood(), where, start, groups, None, 4
     whole = Batches(*given, size=2)
     whole.run(15, None)
-    monkeypatch.setattr(batches, "KEEP_S", -1.0)
+    monkeypatch.setattr(minibatch, "KEEP_S", -1.0)
     kept = []
     stopped = Batches(*given, size=2, keep=lambda state: kept.append(state))
     stopped.run(15, None)

@@ -6,18 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxekf
-from jaxekf import encoder_storage, files, simulate, storage, tables
-from jaxekf.description import Source
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Encoder, Imu, Optical, Recording
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _encoder as encoder_storage
+from jaxekf.io import atomic, csv_table, run_folder
+from jaxekf.io.description import Source
+from jaxekf.recordings.types import Encoder, Imu, Optical, Recording
+from jaxekf.simulation import attitude_runs
 
 BIG = 1_700_000_000_123_456_789
 
 
 def constant(seed=1):
-    return simulate.recording(
+    return attitude_runs.recording(
         "run",
-        simulate.constant_rate_motion(rest_s=0.3),
+        attitude_runs.constant_rate_motion(rest_s=0.3),
         seed=seed,
         duration_s=1.0,
         start_ns=BIG,
@@ -27,7 +29,7 @@ def constant(seed=1):
 
 @pytest.fixture
 def folder(tmp_path):
-    return storage.save(constant(), tmp_path / "run")
+    return run_folder.save(constant(), tmp_path / "run")
 
 
 def edit(file, old, new, count=1):
@@ -36,10 +38,14 @@ def edit(file, old, new, count=1):
     file.write_text(text.replace(old, new, count))
 
 
-@pytest.mark.parametrize("motion", [simulate.constant_rate_motion(), simulate.free_motion(3)])
+@pytest.mark.parametrize(
+    "motion", [attitude_runs.constant_rate_motion(), attitude_runs.free_motion(3)]
+)
 def test_round_trip(tmp_path, motion):
     """Would catch a lost digit of time, a hidden sample that comes back, or a joint on the wrong side."""
-    record = simulate.recording("run", motion, seed=2, duration_s=12.0, start_ns=BIG, dropouts=0.1)
+    record = attitude_runs.recording(
+        "run", motion, seed=2, duration_s=12.0, start_ns=BIG, dropouts=0.1
+    )
     again = jaxekf.load(jaxekf.save(record, tmp_path / "run"))
     assert again.name == "run"
     np.testing.assert_array_equal(again.imu.time_ns, record.imu.time_ns)
@@ -59,7 +65,7 @@ def test_round_trip(tmp_path, motion):
 @given(st.integers(0, 2**62))
 def test_times_are_exact(time_ns):
     """Would catch a time that passes through a float: 1.7e9 s has steps of 238 ns there."""
-    assert tables.parse_seconds(tables.format_seconds(time_ns)) == time_ns
+    assert csv_table.parse_seconds(csv_table.format_seconds(time_ns)) == time_ns
 
 
 @pytest.mark.parametrize(
@@ -68,7 +74,7 @@ def test_times_are_exact(time_ns):
 )
 def test_times_in_other_writing(text, expected):
     """Would catch a parser that knows one way to write a number only."""
-    assert tables.parse_seconds(text) == expected
+    assert csv_table.parse_seconds(text) == expected
 
 
 def test_encoder_frames_and_sides(tmp_path):
@@ -86,7 +92,7 @@ def test_encoder_frames_and_sides(tmp_path):
             "q_optical_encoder": np.roll(frame.as_quat(), 1).tolist(),
         }
         (tmp_path / "encoder.csv").write_text("time,angle\n0,0.7\n")
-        table = tables.read_table(tmp_path / "encoder.csv")
+        table = csv_table.read_table(tmp_path / "encoder.csv")
         stream, _ = encoder_storage.read(table, Source(about, tmp_path, sort=False))
         return Rotation.from_quat(np.roll(stream.q_ref_body[0], -1))
 
@@ -214,17 +220,17 @@ def test_recordings_in_memory_are_checked(make):
 def test_output_is_whole_or_not_there(tmp_path):
     """Would catch a half-written folder, or an old result lost to a failed new one."""
     target = tmp_path / "out"
-    with pytest.raises(ZeroDivisionError), files.whole_folder(target, "recording.toml") as folder:
+    with pytest.raises(ZeroDivisionError), atomic.whole_folder(target, "recording.toml") as folder:
         (folder / "a").write_text("half")
         raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
-    storage.save(constant(), target)
+    run_folder.save(constant(), target)
     with pytest.raises(RecordingError, match="exists"):
-        storage.save(constant(), target)
+        run_folder.save(constant(), target)
     before = sorted(p.name for p in target.iterdir())
     with (
         pytest.raises(ZeroDivisionError),
-        files.whole_folder(target, "recording.toml", overwrite=True),
+        atomic.whole_folder(target, "recording.toml", overwrite=True),
     ):
         raise ZeroDivisionError
     assert sorted(p.name for p in target.iterdir()) == before
@@ -232,7 +238,7 @@ def test_output_is_whole_or_not_there(tmp_path):
 
 def test_encoder_interpolation_invents_nothing():
     """Would catch truth made up over gaps, outside the run, or scored where it was unknown."""
-    from jaxekf.truth import encoder_at
+    from jaxekf.recordings.truth import encoder_at
 
     times = np.array([0, 10, 20, 400, 410], np.int64) * 1_000_000
     q = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1))
@@ -244,13 +250,13 @@ def test_encoder_interpolation_invents_nothing():
 
 def test_overwriting_replaces_only_its_own_kind(tmp_path):
     """Would catch a result that replaces the recording it came from."""
-    target = storage.save(constant(), tmp_path / "run")
+    target = run_folder.save(constant(), tmp_path / "run")
     with pytest.raises(RecordingError, match=r"holds no result.json"):
-        files.check_output(target, "result.json", overwrite=True)
+        atomic.check_output(target, "result.json", overwrite=True)
     (tmp_path / "empty").mkdir()
-    files.check_output(tmp_path / "empty", "result.json")
+    atomic.check_output(tmp_path / "empty", "result.json")
     (tmp_path / "link").symlink_to(target)
-    storage.save(constant(2), tmp_path / "link", overwrite=True)
+    run_folder.save(constant(2), tmp_path / "link", overwrite=True)
     assert (tmp_path / "link").is_symlink()
     assert jaxekf.load(target).info["seed"] == 2
 
@@ -275,7 +281,7 @@ def without(stream, hidden):
 
 def test_a_gap_in_the_input_is_not_bridged():
     """Would catch motion made up while nothing was measured: attitude wrong by degrees, unnoticed."""
-    record = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=6.0)
+    record = attitude_runs.recording("run", attitude_runs.free_motion(1), seed=1, duration_s=6.0)
     t = (record.imu.time_ns - record.imu.time_ns[0]) / 1e9
     gap = record.replace(imu=without(record.imu, (t > 3.0) & (t < 3.5)))
     with pytest.raises(RecordingError, match=r"gap of 0\.5.* s in gyroscope"):
@@ -290,9 +296,9 @@ def test_a_gap_in_the_input_is_not_bridged():
 
 def test_rate_truth_is_not_made_up_over_gaps():
     """Would catch a rate by differences over a hole in the encoder."""
-    from jaxekf.truth import encoder_rate_at
+    from jaxekf.recordings.truth import encoder_rate_at
 
-    record = simulate.recording("run", simulate.free_motion(1), seed=1, duration_s=6.0)
+    record = attitude_runs.recording("run", attitude_runs.free_motion(1), seed=1, duration_s=6.0)
     encoder = record.need_encoder()
     t = (encoder.time_ns - encoder.time_ns[0]) / 1e9
     known = encoder_rate_at(encoder, encoder.time_ns)
@@ -305,8 +311,8 @@ def test_rate_truth_is_not_made_up_over_gaps():
 
 def test_held_samples_go_stale(tmp_path):
     """Would catch a gyroscope that has stopped being held for the rest of the run."""
-    record = simulate.recording(
-        "run", simulate.constant_rate_motion(rest_s=0.5), seed=1, duration_s=4.0
+    record = attitude_runs.recording(
+        "run", attitude_runs.constant_rate_motion(rest_s=0.5), seed=1, duration_s=4.0
     )
     t = (record.imu.time_ns - record.imu.time_ns[0]) / 1e9
     made = jaxekf.estimate(record.replace(imu=without(record.imu, t > 2.0)), "loose_additive")
@@ -321,8 +327,9 @@ def test_aux_of_hidden_samples_is_made_finite():
     """Would catch a NaN beside a hidden sample that reaches the gradient of the noise."""
     from dataclasses import replace
 
-    from jaxekf import get_model, timeline
-    from jaxekf.recording import Samples
+    from jaxekf import get_model
+    from jaxekf.estimation import timeline
+    from jaxekf.recordings.types import Samples
 
     loose = get_model("loose")
     source = loose.sensors[0].source

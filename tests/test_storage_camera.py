@@ -8,9 +8,9 @@ import pytest
 from test_storage_markers import edit, entry, set_cell, swap_lines
 
 import jaxekf
-from jaxekf import gaps
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Camera, Imu, Recording
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings import gaps
+from jaxekf.recordings.types import Camera, Imu, Recording
 
 BIG = 1_700_000_000_123_456_789
 NAMES = ("door", "B 2", 'the "left", upper', "012", "Ω")
@@ -300,12 +300,14 @@ def test_places_are_covered_by_hashes(tmp_path):
     """Would catch landmarks moved since the run was saved, or a run told apart by its points only."""
     path = jaxekf.save(run_of(camera()), tmp_path / "run", hashes=True)
     assert set(jaxekf.load(path).sources) == set(FOLDER)
-    before = jaxekf.hashes.hashed(path)
+    before = jaxekf.io.hashes.hashed(path)
     assert before == jaxekf.load(path).sources
     edit(path / "landmarks.csv", "\n012,", "\n012,0")
     with pytest.raises(RecordingError, match=r"landmarks\.csv: got content of sha256"):
         jaxekf.load(path)
-    assert {k for k, v in jaxekf.hashes.hashed(path).items() if v != before[k]} == {"landmarks.csv"}
+    assert {k for k, v in jaxekf.io.hashes.hashed(path).items() if v != before[k]} == {
+        "landmarks.csv"
+    }
 
 
 def test_places_go_with_the_run(folder):

@@ -8,9 +8,9 @@ import pytest
 import tomli_w
 
 import jaxekf
-from jaxekf import description
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording, from_scipy, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings import facts
+from jaxekf.recordings.types import Encoder, Imu, Markers, Optical, Recording, from_scipy, to_scipy
 
 BIG = 1_700_000_000_123_456_789
 NAMES = ("tip", "B 2", 'the "left", upper')
@@ -123,8 +123,8 @@ def test_facts_come_back_exactly(folder, tmp_path):
 def test_scaling_to_unit_length_is_done_once():
     """Would catch a quaternion whose last digit changes each time that it is saved and read."""
     for drawn in np.random.default_rng(3).normal(size=(200, 4)):
-        unit = description.unit_vector(drawn, 4, "place", "key")
-        again = description.unit_vector(unit, 4, "place", "key")
+        unit = facts.unit_vector(drawn, 4, "place", "key")
+        again = facts.unit_vector(unit, 4, "place", "key")
         np.testing.assert_array_equal(again, unit)
         np.testing.assert_allclose(unit, drawn / np.linalg.norm(drawn), atol=1e-15)
 

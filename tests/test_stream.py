@@ -8,10 +8,10 @@ import pytest
 from test_tight import COARSE, matched, run, until
 
 import jaxekf
-from jaxekf import timeline
-from jaxekf.errors import ModelError
+from jaxekf._support.errors import ModelError
+from jaxekf.estimation import timeline
+from jaxekf.estimation.live import Stream
 from jaxekf.models import tight
-from jaxekf.stream import Stream
 
 
 def live(one, **options):

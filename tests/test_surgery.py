@@ -10,13 +10,13 @@ import pytest
 from scenario import LONG
 from scipy.signal import welch
 
-from jaxekf import kernels
-from jaxekf import simulate_surgery as surgery
-from jaxekf.differential import track
-from jaxekf.placement import AccelerometerArray, exact_readings
-from jaxekf.recording import to_scipy
-from jaxekf.simulate import Motion, seconds
-from jaxekf.simulate_tool import GRAVITY_REF, ToolMotion
+from jaxekf._support import compilation
+from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray, exact_readings
+from jaxekf.pose_solvers.gyro_free_rate import track
+from jaxekf.recordings.types import to_scipy
+from jaxekf.simulation import gyro_free_runs as surgery
+from jaxekf.simulation.attitude_runs import Motion, seconds
+from jaxekf.simulation.marker_runs import GRAVITY_REF, ToolMotion
 
 GRADE = surgery.SurgeryGrade()
 ARRAY = jax.tree.map(np.asarray, surgery.handheld_array())
@@ -153,7 +153,7 @@ def test_rate_of_exact_readings():
     t = INTERVAL * np.arange(1001)
     readings = surgery.specific_forces(motion, ARRAY, t)
     early, plain = (motion.attitude.attitude(t + ahead)[1] for ahead in (0.5 * INTERVAL, 0.0))
-    got = kernels.jit(track)(ARRAY, GRADE.acceleration_sigma, readings[1:], early[0], INTERVAL)
+    got = compilation.jit(track)(ARRAY, GRADE.acceleration_sigma, readings[1:], early[0], INTERVAL)
     assert np.abs(got.rate - early[1:]).max() < 1e-4
     assert np.abs(got.rate - plain[1:]).max() > 1e-3
 

@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxekf import simulate_tool, synchronise
-from jaxekf.datasets import broad
-from jaxekf.errors import RecordingError
-from jaxekf.pose import from_markers
-from jaxekf.recording import Optical, from_scipy, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration import time_offset
+from jaxekf.io.importers import broad
+from jaxekf.pose_solvers.marker_pose import from_markers
+from jaxekf.recordings.types import Optical, from_scipy, to_scipy
+from jaxekf.simulation import marker_runs
 
 TURN = np.deg2rad([1.0, -2.0, 0.5])
 
 
 def poses_and_imu(seed, latency_s=0.0, turn=(0.0, 0.0, 0.0), duration_s=40.0):
     """A simulated run's raw poses, stamped later than taken and in a frame turned in the body."""
-    motion = simulate_tool.free_tool_motion(seed)
-    run = simulate_tool.tool_recording("run", motion, seed=seed, duration_s=duration_s)
+    motion = marker_runs.free_tool_motion(seed)
+    run = marker_runs.tool_recording("run", motion, seed=seed, duration_s=duration_s)
     raw = from_markers(run.markers)
     turned = from_scipy(to_scipy(raw.q_ref_body) * Rotation.from_rotvec(turn))
     stamps = raw.time_ns - raw.latency_ns + round(1e9 * latency_s)
@@ -33,7 +34,7 @@ def test_latency_and_frame_are_found(latency_s):
     for seed in range(6):
         optical, imu = poses_and_imu(seed, latency_s, TURN)
         optical.q_ref_body[100:110] = [1.0, 0.0, 0.0, 0.0]
-        found = synchronise.match(optical, imu)
+        found = time_offset.match(optical, imu)
         scaled.append((found.latency_s - latency_s) / found.latency_sigma_s)
         assert abs(found.latency_s - latency_s) < 3e-3
         np.testing.assert_allclose(found.alignment, TURN, atol=np.deg2rad(0.4))
@@ -51,9 +52,9 @@ def test_what_does_not_turn_is_refused():
         imu, gyroscope=1e-3 * np.random.default_rng(2).standard_normal(imu.gyroscope.shape)
     )
     with pytest.raises(RecordingError, match="so little turning"):
-        synchronise.match(replace(still, q_ref_body=from_scipy(noisy)), at_rest)
+        time_offset.match(replace(still, q_ref_body=from_scipy(noisy)), at_rest)
     with pytest.raises(RecordingError, match="pairs of tracker samples"):
-        synchronise.match(replace(optical, valid=np.zeros(len(optical.time_ns), bool)), imu)
+        time_offset.match(replace(optical, valid=np.zeros(len(optical.time_ns), bool)), imu)
 
 
 def test_real_lag_of_the_gyroscope(data_dir):
@@ -62,4 +63,4 @@ def test_real_lag_of_the_gyroscope(data_dir):
     truth = run.need_encoder()
     whole = Optical(truth.time_ns, truth.q_ref_body, truth.valid)
     for optical in (whole, broad.degrade(run, seed=0, trial=7).need_optical()):
-        assert -0.005 < synchronise.match(optical, run.need_imu()).latency_s < -0.0035
+        assert -0.005 < time_offset.match(optical, run.need_imu()).latency_s < -0.0035

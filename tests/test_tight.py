@@ -12,12 +12,15 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import metrics, online, padding, pose, simulate_tool, timeline
-from jaxekf.errors import ModelError, RecordingError
+from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation import causal, padding, timeline
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.evaluation import metrics
 from jaxekf.models import tight
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import Optical
-from jaxekf.simulate_tool import ToolGrade
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import Optical
+from jaxekf.simulation import marker_runs
+from jaxekf.simulation.marker_runs import ToolGrade
 
 COARSE = ToolGrade(imu_s=0.006)
 """A slower IMU: as good a test, and three times as quick."""
@@ -40,8 +43,8 @@ def matched(grade=COARSE):
 
 
 def run(seed, duration_s=6.0, grade=COARSE, hidden=(), motion=None):
-    motion = motion or simulate_tool.free_tool_motion(seed)
-    return simulate_tool.tool_recording(
+    motion = motion or marker_runs.free_tool_motion(seed)
+    return marker_runs.tool_recording(
         f"run-{seed}", motion, seed=seed, duration_s=duration_s, grade=grade, hidden=hidden
     )
 
@@ -63,9 +66,9 @@ def test_consistency(count):
     hidden = [(name, 3.0, 5.0) for name in ("3", "2", "1")[:count]]
     runs, others = [], []
     for seed in range(100 if os.environ.get("JAXEKF_LONG") else 50):
-        motion = simulate_tool.free_tool_motion(seed)
+        motion = marker_runs.free_tool_motion(seed)
         options = {"seed": seed, "duration_s": 6.0, "grade": COARSE, "hidden": hidden}
-        one, other = simulate_tool.tool_run(f"run-{seed}", motion, **options)
+        one, other = marker_runs.tool_run(f"run-{seed}", motion, **options)
         runs.append(one)
         others.append(other)
     found = jaxekf.estimate_many(runs, "tight", matched())
@@ -116,7 +119,7 @@ def test_raw_pose_against_scipy():
     seen += 0.01 * rng.standard_normal(seen.shape)
     usable = rng.uniform(size=(40, 5)) < 0.8
     seen[~usable] = np.nan
-    fit = pose.absolute_orientation(body, seen, usable)
+    fit = marker_pose.absolute_orientation(body, seen, usable)
     np.testing.assert_array_equal(fit.valid, usable.sum(axis=1) >= 3)
     for i in np.flatnonzero(fit.valid):
         chosen = usable[i]
@@ -127,7 +130,7 @@ def test_raw_pose_against_scipy():
         place = r.mean(axis=0) - expected.apply(b.mean(axis=0))
         np.testing.assert_allclose(fit.position[i], place, atol=1e-9)
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    assert not pose.absolute_orientation(line, line[None], np.ones((1, 3), bool)).valid[0]
+    assert not marker_pose.absolute_orientation(line, line[None], np.ones((1, 3), bool)).valid[0]
 
 
 def test_start_waits_for_three_markers(monkeypatch):
@@ -247,7 +250,7 @@ def test_online_is_a_batch_of_what_had_arrived(latency_s, monkeypatch):
     monkeypatch.setattr(padding, "bucket", lambda count: 512)
     grade = replace(COARSE, latency_s=latency_s)
     one = run(8, duration_s=2.0, grade=grade, hidden=[("1", 0.8, 1.3)])
-    told = online.estimate_online(one, "tight", matched())
+    told = causal.estimate_online(one, "tight", matched())
     assert told.time_ns[0] == one.markers.time_ns[0]
     for instant in (int(told.time_ns[i]) for i in (40, 41, 42, 150, 240)):
         batch = jaxekf.estimate(until(one, instant), "tight", matched())
@@ -267,7 +270,7 @@ def test_online_needs_an_input():
     optical = Optical(times, still, np.ones(50, bool))
     imu = run(0, duration_s=1.0).imu
     with pytest.raises(ModelError, match="without input"):
-        online.estimate_online(jaxekf.Recording("r", optical, imu), "loose_rate")
+        causal.estimate_online(jaxekf.Recording("r", optical, imu), "loose_rate")
 
 
 def test_object_frame():
@@ -277,11 +280,11 @@ def test_object_frame():
     info = dict(one.info) | {"p_body_object": [0.0, 0.0, 0.3], "q_body_object": turn.tolist()}
     made = jaxekf.estimate(one.replace(info=info), "tight", matched())
     point = np.array([0.0, 0.0, 0.3])
-    rotation = jaxekf.recording.to_scipy(made.attitude.value)
+    rotation = jaxekf.recordings.types.to_scipy(made.attitude.value)
     where = made.outputs["position"].value + rotation.apply(point)
     np.testing.assert_allclose(made.outputs["object_position"].value, where, atol=1e-12)
-    whole = rotation * jaxekf.recording.to_scipy(turn)
-    got = jaxekf.recording.to_scipy(made.outputs["object_attitude"].value)
+    whole = rotation * jaxekf.recordings.types.to_scipy(turn)
+    got = jaxekf.recordings.types.to_scipy(made.outputs["object_attitude"].value)
     assert (got.inv() * whole).magnitude().max() < 1e-12
     speed = np.gradient(where, made.time, axis=0)
     settled = slice(100, -100)
@@ -340,7 +343,7 @@ def test_markers_of_another_unit_are_refused(model):
 def test_a_pose_to_start_from_turns_as_the_gyroscope_did():
     """A first pose 20 deg off: gates then refuse every good one until the belief is widened."""
     one = run(6, duration_s=1.0)
-    poses = pose.from_markers(one.markers)
+    poses = marker_pose.from_markers(one.markers)
     wrong = poses.q_ref_body.copy()
     wrong[:2] = wrong[:2] @ np.diag([0.98, 1.0, 1.0, 1.0]) + [0.0, 0.17, 0.0, 0.0]
     wrong[:2] /= np.linalg.norm(wrong[:2], axis=1)[:, None]

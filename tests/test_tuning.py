@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 import jaxekf
 import tuning
-from jaxekf import simulate
-from jaxekf.errors import TuningError
-from jaxekf.parameters import as_arrays
-from tuning import noise, objectives, walk
+from jaxekf._support.errors import TuningError
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.simulation import attitude_runs
+from tuning.objective import objectives
+from tuning.parametrisation import free_vector
+from tuning.search import _line_search as line_search
 
 PLANTED = {"gyroscope": 0.05, "optical": 0.3}
 
@@ -23,9 +25,9 @@ PLANTED = {"gyroscope": 0.05, "optical": 0.3}
 def planted():
     """Six training runs of 120 s and three held out, with known noise."""
     return [
-        simulate.recording(
+        attitude_runs.recording(
             f"run-{i}",
-            simulate.free_motion(i),
+            attitude_runs.free_motion(i),
             seed=i,
             duration_s=120.0,
             occlusions=[(40.0, 41.0)],
@@ -38,7 +40,9 @@ def planted():
 def short():
     """Two short runs for tests of the loop itself."""
     return [
-        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0)
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0
+        )
         for i in range(2)
     ]
 
@@ -86,8 +90,8 @@ def test_planted_noise_is_found(planted, objective, factor):
 
 def test_planted_calibration_is_found():
     """Would catch a clock offset or gyroscope matrix of the wrong sign, frame or size."""
-    record = simulate.recording(
-        "run", simulate.free_motion(3, speed_deg=60.0), seed=3, duration_s=20.0
+    record = attitude_runs.recording(
+        "run", attitude_runs.free_motion(3, speed_deg=60.0), seed=3, duration_s=20.0
     )
     imu = record.need_imu()
     matrix = np.array([[1.01, 0.004, -0.006], [-0.003, 0.99, 0.005], [0.002, -0.004, 1.005]])
@@ -141,7 +145,9 @@ def test_early_stop(short):
 def test_the_scale_of_all_covariances_leaves_the_estimate(short):
     """Would catch a rescaling that forgets Q, R or P0."""
     base = start_at(1.0)
-    one, other = (jaxekf.estimate(short[0], "loose", p) for p in (base, noise.scaled(base, 7.0)))
+    one, other = (
+        jaxekf.estimate(short[0], "loose", p) for p in (base, free_vector.scaled(base, 7.0))
+    )
     np.testing.assert_allclose(one.attitude.value, other.attitude.value, atol=1e-12)
     np.testing.assert_allclose(7.0 * one.cov, other.cov, rtol=1e-10, atol=1e-18)
 
@@ -164,14 +170,14 @@ def test_files_say_units_and_origin(full, tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-15)
 
 
-@given(st.lists(st.floats(1e-6, 1e3), min_size=3, max_size=3), st.sampled_from(noise.AXES))
+@given(st.lists(st.floats(1e-6, 1e3), min_size=3, max_size=3), st.sampled_from(free_vector.AXES))
 def test_free_vectors_round_trip(values, axes):
     """Would catch a parametrisation whose inverse is not its inverse."""
     model = jaxekf.get_model("loose")
     deviations = np.array(values)
     params = model.parameters._replace(noise=model.parameters.noise._replace(optical=deviations))
-    base = noise.with_axes(model, params, axes)
-    where = noise.layout(model, base, ["noise", "calibration", "initial"])
+    base = free_vector.with_axes(model, params, axes)
+    where = free_vector.layout(model, base, ["noise", "calibration", "initial"])
     free = where.to_free(base)
     assert len(where.labels()) == len(free)
     for a, b in zip(
@@ -184,8 +190,8 @@ def test_free_vectors_round_trip(values, axes):
 def test_any_free_vector_is_a_positive_definite_covariance(values):
     """Would catch a full covariance that a step of the optimiser can make indefinite."""
     model = jaxekf.get_model("loose")
-    base = noise.with_axes(model, model.parameters, "full")
-    where = noise.layout(model, base)
+    base = free_vector.with_axes(model, model.parameters, "full")
+    where = free_vector.layout(model, base)
     params = where.from_free(jnp.asarray(values), base)
     for leaf in params.noise:
         assert np.all(np.diagonal(leaf) > 0.0)
@@ -235,7 +241,7 @@ def test_objectives_add_and_scale():
 
 def test_walk_stops_when_it_has_converged():
     """Would catch a line search that never ends at a minimum."""
-    steps = walk.Walk(jnp.array([3.0, -2.0]), None)
+    steps = line_search.Walk(jnp.array([3.0, -2.0]), None)
     for _ in range(60):
         value = float(jnp.sum(steps.candidate**2) + 1.0)
         if steps.move(value, 2.0 * steps.candidate, True):
@@ -251,7 +257,7 @@ def test_what_is_not_free_is_not_touched(full):
     np.testing.assert_array_equal(full.params.noise.gyroscope, each)
     assert each.shape == (3,)
     assert full.params.noise.optical.shape == (3, 3)
-    where = noise.layout(full.model, full.start)
+    where = free_vector.layout(full.model, full.start)
     kept = where.from_free(where.to_free(full.start), full.start)
     np.testing.assert_allclose(kept.noise.gyroscope, each, rtol=1e-14)
 

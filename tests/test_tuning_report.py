@@ -15,18 +15,19 @@ from test_report_browser import BROWSER, dom
 
 import jaxekf
 import tuning
-from jaxekf import simulate
+from jaxekf._support.errors import RecordingError, TuningError
 from jaxekf.cli import main
-from jaxekf.errors import RecordingError, TuningError
-from jaxekf.parameters import as_arrays
-from jaxekf.report import tuned as saved
-from jaxekf.report import tuning_figures, write_report
-from tuning import cautions
-from tuning.descent import Iteration
-from tuning.information import Information
-from tuning.record import record
-from tuning.starts import Outcome
-from tuning.validation import as_dicts
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.reporting.report import _tuned as saved
+from jaxekf.reporting.report import _tuning_figures as tuning_figures
+from jaxekf.reporting.report import write_report
+from jaxekf.simulation import attitude_runs
+from tuning.comparison.compare import as_dicts
+from tuning.objective.fisher_information import Information
+from tuning.persistence import _tuning_warnings as tuning_warnings
+from tuning.persistence.tuning_document import record
+from tuning.search.descent import Iteration
+from tuning.search.multistart import Outcome
 
 NAME = 'free <b>&"5"'
 COLUMNS = (
@@ -46,7 +47,9 @@ def call(*arguments):
 @pytest.fixture(scope="module")
 def runs():
     return [
-        simulate.recording(f"run-{i}", simulate.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0)
+        attitude_runs.recording(
+            f"run-{i}", attitude_runs.free_motion(i, rest_s=0.2), seed=i, duration_s=3.0
+        )
         for i in range(3)
     ]
 
@@ -359,7 +362,7 @@ def test_warnings_appear_when_they_should_and_only_then(spoil, words):
     """Would catch a warning that never comes, comes always, or names another number, run or limit."""
     document = plain()
     spoil(document)
-    told = cautions.cautions(document)
+    told = tuning_warnings.cautions(document)
     assert len(told) == len(words)
     for sentence, part in zip(told, words, strict=True):
         assert part in sentence
@@ -370,7 +373,7 @@ def test_training_runs_are_not_blamed_for_their_nees():
     document = plain()
     alone(document)
     document["rows"][2]["nees"] = 9.0
-    assert len(cautions.cautions(document)) == 1
+    assert len(tuning_warnings.cautions(document)) == 1
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,10 @@ from scipy.stats import binom, chi2, kstest
 
 import jaxekf
 import tuning
-from jaxekf import metrics, simulate
-from jaxekf.truth import encoder_at
-from tuning import noise
+from jaxekf.evaluation import metrics
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.simulation import attitude_runs
+from tuning.parametrisation import free_vector
 
 pytestmark = pytest.mark.long
 
@@ -32,9 +33,9 @@ FREE = [
 
 def planted(seed, duration_s=30.0):
     """A run whose gyroscope lags and is scaled and skewed."""
-    run = simulate.recording(
+    run = attitude_runs.recording(
         f"run-{seed}",
-        simulate.free_motion(seed, speed_deg=60.0, rest_s=0.5),
+        attitude_runs.free_motion(seed, speed_deg=60.0, rest_s=0.5),
         seed=seed,
         duration_s=duration_s,
     )
@@ -114,12 +115,12 @@ def test_held_out_errors_are_as_large_as_said():
 
 def test_what_no_motion_told_is_left_alone():
     """Would catch a gyroscope matrix made up for axes that never turned (row 8)."""
-    motion = simulate.free_motion(3, speed_deg=60.0, rest_s=0.5)
+    motion = attitude_runs.free_motion(3, speed_deg=60.0, rest_s=0.5)
     assert motion.amplitude is not None
     still = np.zeros_like(motion.amplitude)
     still[2] = motion.amplitude[2]
     flat = replace(motion, amplitude=still)
-    runs = [simulate.recording(f"flat-{i}", flat, seed=i, duration_s=40.0) for i in range(2)]
+    runs = [attitude_runs.recording(f"flat-{i}", flat, seed=i, duration_s=40.0) for i in range(2)]
     one = tuning.tune(
         runs[:1], objective="map", free=["noise", *FREE[2:]], judge=True, iterations=60
     )
@@ -135,6 +136,6 @@ def test_what_no_motion_told_is_left_alone():
         for p in (one.params, MODEL.parameters)
     ]
     assert scores[0] <= 1.01 * scores[1]
-    where = noise.layout(MODEL, one.params, ["noise"])
+    where = free_vector.layout(MODEL, one.params, ["noise"])
     moved = np.asarray(where.to_free(one.params)) - np.asarray(where.to_free(one.start))
     assert np.exp(2.0 * moved).min() > 1e-3

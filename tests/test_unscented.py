@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from oracle import attitude_errors, exp, right_jacobian
 from scipy.spatial.transform import Rotation
 
-from jaxekf import SO3, Euclidean, jit, rotation, unscented, vectors
+from jaxekf import SO3, Euclidean, jit
+from jaxekf.geometry import rotation, triad, unscented
 
 DRAWS = 100_000
 
@@ -129,18 +130,18 @@ def test_quadratic_against_draws():
 
 PAIR = Euclidean(6)
 HALF_TURNS = np.pi * np.array([[1.0, 0.0, 0.0], [0.6, -0.48, 0.64], [0.0, 1e-7 - 1.0, 0.0]])
-triad_many = jit(jax.vmap(vectors.triad, (0, 0, None, None)))
+triad_many = jit(jax.vmap(triad.triad, (0, 0, None, None)))
 
 
 @jit
 def triad_moments(readings, cov, ref):
     def attitude(x):
-        return vectors.triad(x[:3], x[3:], *ref).q_ref_body
+        return triad.triad(x[:3], x[3:], *ref).q_ref_body
 
     return unscented.transform_on(attitude, readings, cov, PAIR, SO3(), beta=2.0)
 
 
-REFERENCES = np.stack(vectors.north_west_up(1.1))
+REFERENCES = np.stack(triad.north_west_up(1.1))
 
 
 def drawn_attitudes(turn, noise, standard):

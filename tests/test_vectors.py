@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from oracle import attitude_errors
 from scipy.spatial.transform import Rotation
 
-from jaxekf import jit, rotation, vectors
+from jaxekf import jit
+from jaxekf.geometry import rotation
+from jaxekf.geometry import triad as vectors
 
 DRAWS = 100_000
 AXES = [*np.eye(3), *-np.eye(3), np.array([0.6, -0.48, 0.64]), np.array([-0.8, 0.6, 0.0])]

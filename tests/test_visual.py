@@ -14,28 +14,22 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
-from jaxekf import (
-    ekf,
-    linalg,
-    manifold,
-    padding,
-    plots,
-    projection,
-    regions,
-    resection,
-    simulate,
-    simulate_camera,
-    timeline,
-)
 from jaxekf.cli.estimate import _row as table_row
-from jaxekf.model import Belief
-from jaxekf.models import correspondences, visual
-from jaxekf.parameters import as_arrays
-from jaxekf.plots import sight
-from jaxekf.recording import from_scipy, to_scipy
-from jaxekf.simulate_camera import CameraGrade, camera_recording
-from jaxekf.truth import encoder_at
-from tuning.validation import _tracker_nis as tracker_nis
+from jaxekf.estimation import padding, timeline
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.filtering import ekf
+from jaxekf.filtering.model import Belief
+from jaxekf.geometry import linalg, manifold, pinhole
+from jaxekf.models import _correspondences as correspondences
+from jaxekf.models import search_regions, visual
+from jaxekf.pose_solvers import pnp
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.recordings.types import from_scipy, to_scipy
+from jaxekf.reporting import plots
+from jaxekf.reporting.plots import _sight as sight
+from jaxekf.simulation import attitude_runs, camera_runs
+from jaxekf.simulation.camera_runs import CameraGrade, camera_recording
+from tuning.comparison.compare import _tracker_nis as tracker_nis
 
 POINTS, SECONDS = 8, 5.0
 """The same for all runs that are estimated: one compilation."""
@@ -132,7 +126,7 @@ def drawn(count, seconds, keep="everything", **changes):
         start = manifold.retract(
             model.space, mean, jnp.linalg.cholesky(cov) @ jax.random.normal(first, (21,))
         )
-        return simulate.draw(model, params, start, steps, rest)
+        return attitude_runs.draw(model, params, start, steps, rest)
 
     def follow(truth, seen):
         output = ekf.run_filter(model, params, Belief(mean, cov), seen)
@@ -182,16 +176,16 @@ def test_search_regions_hold_what_is_found(runs):
     """Would catch a region that lacks the pose's uncertainty or the point's noise (row 6)."""
     _, params, _, (_, _, ahead, camera) = runs
     find = scenario.quick_jit(
-        jax.vmap(jax.vmap(partial(regions.search_regions, params))), static_argnums=()
+        jax.vmap(jax.vmap(partial(search_regions.search_regions, params))), static_argnums=()
     )
     found = find(ahead, camera.aux.p_ref_landmark)
     shape = (*camera.mask.shape[:-1], POINTS, 2)
     mask = np.asarray(camera.mask).reshape(shape).all(axis=-1) & np.asarray(found.in_front)
     pixel = np.asarray(camera.value).reshape(shape)
-    share = regions.inside(found, pixel)[mask].mean()
+    share = search_regions.inside(found, pixel)[mask].mean()
     assert mask.sum() > 10_000
     assert 0.985 <= share <= 0.995
-    half, angle = regions.ellipses(found)
+    half, angle = search_regions.ellipses(found)
     spread = np.asarray(found.cov)[mask]
     direction = np.stack([np.cos(angle[mask]), np.sin(angle[mask])], axis=-1)
     along = np.einsum("ni,nij,nj->n", direction, spread, direction)
@@ -224,7 +218,7 @@ def test_images_alone_with_mismatches():
         camera = run.camera
         floor = camera.usable & (camera.p_ref_landmark[:, 0] == 0.0)
         beside += np.sum(floor.sum(axis=1) == 1)
-        found = resection.poses(camera)
+        found = pnp.poses(camera)
         assert found.valid.all()
         at = encoder_at(run.need_encoder(), camera.time_ns)
         off = np.linalg.norm(found.position - at.position, axis=1)[at.valid]
@@ -242,11 +236,11 @@ def test_images_without_a_pose_are_told():
     mixed = camera.visible.copy()
     mixed[::2] = three.visible[::2]
     for changed, valid in ((three, 0), (replace(camera, visible=mixed), len(mixed) // 2)):
-        found = resection.poses(changed)
+        found = pnp.poses(changed)
         assert found.valid.sum() == valid
         assert not found.position[~found.valid].any()
         assert not found.fits[~found.valid].any()
-    whole = resection.poses(camera)
+    whole = pnp.poses(camera)
     np.testing.assert_allclose(found.position[1::2], whole.position[1::2], atol=1e-8)
 
 
@@ -275,7 +269,7 @@ def test_a_start_is_sought_where_a_pose_follows():
     samples = {"camera": correspondences.camera(8, False, late)}
     start = correspondences.find_start(late, samples)
     assert start.time_ns == camera.time_ns[40]
-    whole = resection.poses(late.camera)
+    whole = pnp.poses(late.camera)
     np.testing.assert_allclose(start.first["position"], whole.position[40], atol=1e-8)
     near = slice(40, 45)
     t = (camera.time_ns[near] - camera.time_ns[40]) / 1e9
@@ -305,7 +299,7 @@ def test_a_start_is_where_the_pose_is_known(monkeypatch):
     # As many landmarks as elsewhere, of which the others are never seen, and as long: the same program.
     monkeypatch.setattr(padding, "bucket", lambda count: 64)
     run = run.replace(camera=with_unseen(run.camera, POINTS - 4))
-    first = int(np.argmax(resection.poses(run.camera).valid))
+    first = int(np.argmax(pnp.poses(run.camera).valid))
     made = jaxekf.estimate(run, "visual")
     assert made.time_ns[0] > run.camera.time_ns[first]
     position, attitude = errors(made, run)
@@ -318,7 +312,7 @@ def test_a_start_does_not_wait_for_the_best_image():
     """Would catch a run of poor images of which most is lost before the one that tells its pose best."""
     run = camera_recording("run", seed=0, duration_s=6.0, grade=few(pixel=6.0))
     camera = run.camera
-    found = resection.poses(camera)
+    found = pnp.poses(camera)
     doubt = np.where(found.valid, correspondences._doubt(found), np.inf)
     assert np.argmin(doubt) > 50
     start = correspondences.find_start(run, {"camera": correspondences.camera(8, False, run)})
@@ -335,7 +329,7 @@ def test_what_lies_behind_the_camera_tells_nothing():
     """Would catch slopes of points that no image shows, which let such a point through every gate and make
     the covariance infinite."""
     params = as_arrays(visual.DEFAULTS)
-    project = partial(projection.project, visual.lens_of(params))
+    project = partial(pinhole.project, visual.lens_of(params))
     both = jax.jit(lambda place: (project(place), jax.jacrev(project)(place)))
     for place in ([0.1, 0.2, -0.5], [0.1, 0.2, 0.0], [0.1, 0.2, 1e-4]):
         point, slope = both(jnp.asarray(place))
@@ -346,7 +340,7 @@ def test_what_lies_behind_the_camera_tells_nothing():
 def test_a_point_that_no_lens_maps_is_no_point():
     """Would catch sums of an image that one huge point makes infinite, so that no image has a pose."""
     camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
-    known = resection.poses(camera)
+    known = pnp.poses(camera)
     image, landmark = np.argwhere(camera.usable)[0]
     # A point at which the lens maps nothing: ``1 + radial r^2`` is 0 there.
     bent = replace(camera, radial=np.array([-0.25, 0.0]))
@@ -356,7 +350,7 @@ def test_a_point_that_no_lens_maps_is_no_point():
     ):
         point = camera.pixel.copy()
         point[image, landmark] = pixel
-        found = resection.poses(replace(changed, pixel=point))
+        found = pnp.poses(replace(changed, pixel=point))
         assert not found.fits[image, landmark]
         assert np.isfinite(found.position).all()
         if changed is camera:
@@ -364,7 +358,7 @@ def test_a_point_that_no_lens_maps_is_no_point():
             np.testing.assert_allclose(found.position[1:], known.position[1:], atol=1e-8)
     point = camera.pixel.copy()
     point[image] = 1e300
-    assert resection.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
+    assert pnp.poses(replace(camera, pixel=point)).valid.sum() == known.valid.sum() - 1
 
 
 def test_figures_of_a_camera(tmp_path):
@@ -400,11 +394,11 @@ def test_poses_are_kept_with_their_camera():
     """Would catch images solved again for every figure, and poses of a camera that is gone given to another
     at the same place in memory."""
     camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
-    found = resection.poses(camera)
-    assert resection.poses(camera) is found and resection.solved(camera) is found
-    kept = len(resection._KEPT)
+    found = pnp.poses(camera)
+    assert pnp.poses(camera) is found and pnp.solved(camera) is found
+    kept = len(pnp._KEPT)
     del camera
-    assert len(resection._KEPT) == kept - 1
+    assert len(pnp._KEPT) == kept - 1
 
 
 def test_tables_count_a_camera_as_the_tracker():
@@ -464,7 +458,7 @@ def test_the_camera_is_found_where_it_is():
     for seed in range(4):
         run = camera_recording(
             f"run-{seed}",
-            simulate_camera.shaken(seed),
+            camera_runs.shaken(seed),
             seed=seed,
             duration_s=15.0,
             # A minute of eight points leaves a standard deviation of 2 mm, of thirty 1 mm.

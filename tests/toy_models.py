@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxekf import interpolation, manifold, rotation
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Belief, Input, Model, Parameters, Sensor, repeated
-from jaxekf.timeline import Knots, Rows, Steps
+from jaxekf.filtering import interpolation
+from jaxekf.filtering.model import Belief, Input, Model, Parameters, Sensor, repeated
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.geometry import manifold, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
 
 
 class Empty(NamedTuple):

@@ -2,32 +2,39 @@
 
 from typing import TYPE_CHECKING
 
-from jaxekf.lazy import attributes
+from jaxekf._support.lazy import attributes
 
 if TYPE_CHECKING:
-    from tuning.beside import BESIDE
-    from tuning.data import Data, prepare
-    from tuning.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
-    from tuning.descent import Iteration
-    from tuning.fit import Tuned, fit_runs, tune
-    from tuning.fitted import Fitted
-    from tuning.folds import CrossValidation, Fold, Limits, ParameterSpread, Spread, cross_validate
-    from tuning.frame import TruthFrame
-    from tuning.information import Information
-    from tuning.kept import forget_folds
-    from tuning.noise import Free, Layout, layout, scaled, with_axes
-    from tuning.objectives import (
+    from tuning._tune import Tuned, fit_runs, tune
+    from tuning.comparison.baselines import BESIDE
+    from tuning.comparison.compare import Comparison, Row, compare, mean_by_variant
+    from tuning.comparison.cost import Work
+    from tuning.comparison.cross_validation import (
+        CrossValidation,
+        Fold,
+        Limits,
+        ParameterSpread,
+        Spread,
+        cross_validate,
+    )
+    from tuning.objective.data import Data, prepare
+    from tuning.objective.fisher_information import Information
+    from tuning.objective.objectives import (
         Objective,
         attitude_error,
         evaluate,
         innovation_likelihood,
         rate_error,
     )
-    from tuning.record import save_record
-    from tuning.spec import read_free
-    from tuning.starts import Outcome
-    from tuning.validation import Comparison, Row, compare, mean_by_variant
-    from tuning.work import Work
+    from tuning.parametrisation.free_toml import read_free
+    from tuning.parametrisation.free_vector import Free, Layout, layout, scaled, with_axes
+    from tuning.parametrisation.truth_frame import TruthFrame
+    from tuning.persistence.fold_checkpoint import forget_folds
+    from tuning.persistence.tuning_document import save_record
+    from tuning.results import Fitted
+    from tuning.search.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
+    from tuning.search.descent import Iteration
+    from tuning.search.multistart import Outcome
 
 __all__ = [
     "BESIDE",
@@ -71,13 +78,13 @@ __all__ = [
 ]
 
 _PLACES = {
-    "tuning.beside": ("BESIDE",),
-    "tuning.data": ("Data", "prepare"),
-    "tuning.derivative_free": ("Searched", "tune_by_coordinates", "tune_by_nelder_mead"),
-    "tuning.descent": ("Iteration",),
-    "tuning.fit": ("Tuned", "fit_runs", "tune"),
-    "tuning.fitted": ("Fitted",),
-    "tuning.folds": (
+    "tuning.comparison.baselines": ("BESIDE",),
+    "tuning.objective.data": ("Data", "prepare"),
+    "tuning.search.derivative_free": ("Searched", "tune_by_coordinates", "tune_by_nelder_mead"),
+    "tuning.search.descent": ("Iteration",),
+    "tuning._tune": ("Tuned", "fit_runs", "tune"),
+    "tuning.results": ("Fitted",),
+    "tuning.comparison.cross_validation": (
         "CrossValidation",
         "Fold",
         "Limits",
@@ -85,22 +92,22 @@ _PLACES = {
         "Spread",
         "cross_validate",
     ),
-    "tuning.frame": ("TruthFrame",),
-    "tuning.information": ("Information",),
-    "tuning.kept": ("forget_folds",),
-    "tuning.noise": ("Free", "Layout", "layout", "scaled", "with_axes"),
-    "tuning.objectives": (
+    "tuning.parametrisation.truth_frame": ("TruthFrame",),
+    "tuning.objective.fisher_information": ("Information",),
+    "tuning.persistence.fold_checkpoint": ("forget_folds",),
+    "tuning.parametrisation.free_vector": ("Free", "Layout", "layout", "scaled", "with_axes"),
+    "tuning.objective.objectives": (
         "Objective",
         "attitude_error",
         "evaluate",
         "innovation_likelihood",
         "rate_error",
     ),
-    "tuning.record": ("save_record",),
-    "tuning.spec": ("read_free",),
-    "tuning.starts": ("Outcome",),
-    "tuning.validation": ("Comparison", "Row", "compare", "mean_by_variant"),
-    "tuning.work": ("Work",),
+    "tuning.persistence.tuning_document": ("save_record",),
+    "tuning.parametrisation.free_toml": ("read_free",),
+    "tuning.search.multistart": ("Outcome",),
+    "tuning.comparison.compare": ("Comparison", "Row", "compare", "mean_by_variant"),
+    "tuning.comparison.cost": ("Work",),
 }
 
 if not TYPE_CHECKING:

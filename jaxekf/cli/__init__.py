@@ -39,8 +39,8 @@ def main() -> None:
     or with camera.csv and landmarks.csv.
     """
     # JAX costs most of a second: not for the help and the version, which end before this.
+    from jaxekf._support.compilation import set_up
     from jaxekf.cli.machine import prepare
-    from jaxekf.kernels import set_up
 
     set_up()
     prepare()

@@ -7,15 +7,14 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import parameters
-from jaxekf.alignment import (
+from jaxekf.calibration.alignment import (
     RunAlignment,
     Together,
     align_run,
     calibration_for,
     together,
 )
-from jaxekf.attitude_match import AttitudeMatch
+from jaxekf.calibration.attitude_alignment import AttitudeMatch
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -26,12 +25,13 @@ from jaxekf.cli.console import (
     sort_option,
 )
 from jaxekf.cli.estimate import load_runs
-from jaxekf.description import SCHEMA_VERSION
-from jaxekf.estimation import provenance
-from jaxekf.files import check_output, finite_or_null, whole_folder
-from jaxekf.hashes import inputs_of
+from jaxekf.estimation import parameters
+from jaxekf.estimation.batch import provenance
+from jaxekf.io.atomic import check_output, finite_or_null, whole_folder
+from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.hashes import inputs_of
 from jaxekf.models import get_model
-from jaxekf.recording import Floats
+from jaxekf.recordings.types import Floats
 
 
 @click.command()

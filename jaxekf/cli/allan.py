@@ -6,8 +6,16 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import parameters
-from jaxekf.allan import SensorNoise
+from jaxekf.calibration.allan import SensorNoise
+from jaxekf.calibration.noise_densities import Estimated
+from jaxekf.calibration.static_interval import TrackerNoise
+from jaxekf.calibration.static_noise import (
+    AXES,
+    as_dict,
+    start_for,
+    static_noise,
+    write_curve,
+)
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -16,15 +24,14 @@ from jaxekf.cli.console import (
     print_json,
     print_table,
 )
-from jaxekf.densities import Estimated
-from jaxekf.estimation import provenance
-from jaxekf.files import check_output, whole_folder
-from jaxekf.hashes import inputs_of
+from jaxekf.estimation import parameters
+from jaxekf.estimation.batch import provenance
+from jaxekf.io.atomic import check_output, whole_folder
+from jaxekf.io.hashes import inputs_of
+from jaxekf.io.run_folder import read_log
 from jaxekf.models import get_model
-from jaxekf.plots.deviations import allan as draw
-from jaxekf.plots.style import save
-from jaxekf.rest import TrackerNoise
-from jaxekf.static_noise import AXES, as_dict, read_log, start_for, static_noise, write_curve
+from jaxekf.reporting.plots.deviations import allan as draw
+from jaxekf.reporting.plots.style import save
 
 
 @click.command()

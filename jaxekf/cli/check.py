@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from jaxekf import storage
+from jaxekf._support.errors import RecordingError
+from jaxekf.checks.inspection import Inspection, StreamFound, inspect
+from jaxekf.checks.sensor_agreement import Evidence
 from jaxekf.cli.align import aligned_row, alignment_columns, match_document, run_document
 from jaxekf.cli.console import (
     json_option,
@@ -19,14 +21,12 @@ from jaxekf.cli.console import (
     print_table,
     sort_option,
 )
-from jaxekf.description import SCHEMA_VERSION
-from jaxekf.errors import RecordingError
-from jaxekf.evidence import Evidence
-from jaxekf.files import check_output, finite_or_null, whole_folder
-from jaxekf.inspection import Inspection, StreamFound, inspect
-from jaxekf.plots.style import save
-from jaxekf.plots.timeaxis import time_axis
-from jaxekf.recording import Recording
+from jaxekf.io import run_folder
+from jaxekf.io.atomic import check_output, finite_or_null, whole_folder
+from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.recordings.types import Recording
+from jaxekf.reporting.plots.style import save
+from jaxekf.reporting.plots.timeaxis import time_axis
 
 STATUS = {"fine": 0, "faults": 1, "warnings": 3}
 """Exit status by verdict; 2 is that of a command that was called wrongly."""
@@ -95,7 +95,7 @@ def check(
 
 def _check(path: Path, *, sort: bool) -> Checked:
     try:
-        recording = storage.load(path, sort=sort)
+        recording = run_folder.load(path, sort=sort)
     except (RecordingError, OSError) as error:
         return Checked(path, None, None, str(error))
     return Checked(path, recording, inspect(recording), None)

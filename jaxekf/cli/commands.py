@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import click
 from click.shell_completion import CompletionItem
 
-from jaxekf.errors import JaxekfError
+from jaxekf._support.errors import JaxekfError
 
 WRITTEN = "jaxekf.written"
 """Where a command's context keeps the outputs that are finished."""

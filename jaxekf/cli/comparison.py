@@ -9,8 +9,8 @@ import numpy as np
 
 import tuning
 from jaxekf.cli.console import print_table
-from jaxekf.model import Model
-from jaxekf.parameters import leaf_names
+from jaxekf.estimation.parameters import leaf_names
+from jaxekf.filtering.model import Model
 
 
 def units_by_name(model: Model) -> dict[str, str]:

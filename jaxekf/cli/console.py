@@ -14,10 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxekf.cli.commands import WRITTEN
-from jaxekf.description import SCHEMA_VERSION
-from jaxekf.files import finite_or_null
+from jaxekf.io.atomic import finite_or_null
+from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.models import REGISTRY
-from jaxekf.robust_weights import MEANS
+from jaxekf.models.robust import MEANS
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."

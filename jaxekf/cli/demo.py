@@ -12,19 +12,19 @@ import numpy as np
 import tuning
 from jaxekf.cli.comparison import print_comparison
 from jaxekf.cli.console import json_option, note, print_json, tuning_progress
-from jaxekf.datasets import demo as runs
-from jaxekf.description import SCHEMA_VERSION
-from jaxekf.diagnostics import diagnose
-from jaxekf.estimation import estimate_many, provenance
-from jaxekf.files import check_output, whole_folder
-from jaxekf.hashes import inputs_of
-from jaxekf.model import Parameters
+from jaxekf.estimation.batch import estimate_many, provenance
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.estimation.result import Estimate
+from jaxekf.evaluation.diagnosis import diagnose
+from jaxekf.filtering.model import Parameters
+from jaxekf.io.atomic import check_output, whole_folder
+from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.hashes import inputs_of
+from jaxekf.io.run_folder import load
 from jaxekf.models import get_model
-from jaxekf.parameters import as_arrays
-from jaxekf.recording import Recording
-from jaxekf.result import Estimate
-from jaxekf.storage import load
-from tuning.validation import as_dicts, compare_estimates
+from jaxekf.recordings.types import Recording
+from jaxekf.simulation import demo as runs
+from tuning.comparison.compare import as_dicts, compare_estimates
 
 # What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
@@ -79,7 +79,7 @@ def demo(output: Path, as_json: bool) -> None:
     every = [*training, *validation, *testing]
     # Figures and their libraries are imported by `_ahead`, while the compiler works.
     from jaxekf.cli.plot import draw
-    from jaxekf.plots import possible_figures
+    from jaxekf.reporting.plots import possible_figures
 
     figures = []
     with whole_folder(output, "demo.json", overwrite=True) as folder:

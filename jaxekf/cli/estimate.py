@@ -7,7 +7,8 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxekf import manifold, memory, metrics, parameters, storage
+from jaxekf._support import memory
+from jaxekf._support.errors import RecordingError
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -20,19 +21,22 @@ from jaxekf.cli.console import (
     sort_option,
     wrote,
 )
-from jaxekf.diagnostics import Diagnosis, diagnose, diagnose_many
-from jaxekf.errors import RecordingError
-from jaxekf.estimation import estimate_many
-from jaxekf.export import FILES
-from jaxekf.files import check_output
-from jaxekf.gaps import split_at_gaps
-from jaxekf.model import Model
+from jaxekf.estimation import parameters
+from jaxekf.estimation.batch import estimate_many
+from jaxekf.estimation.causal import estimate_online
+from jaxekf.estimation.output_times import Every, Requested, every, read_requested
+from jaxekf.estimation.result import Estimate, trackers
+from jaxekf.evaluation import metrics
+from jaxekf.evaluation.diagnosis import Diagnosis, diagnose, diagnose_many
+from jaxekf.filtering.model import Model
+from jaxekf.geometry import manifold
+from jaxekf.io import run_folder
+from jaxekf.io.atomic import check_output
+from jaxekf.io.export import FILES
 from jaxekf.models import get_model
-from jaxekf.online import estimate_online
-from jaxekf.recording import Recording
-from jaxekf.requested import Every, Requested, every, read_requested
-from jaxekf.result import Estimate, trackers
-from jaxekf.robust_weights import Means, robust
+from jaxekf.models.robust import Means, robust
+from jaxekf.recordings.gaps import split_at_gaps
+from jaxekf.recordings.types import Recording
 
 
 def load_runs(
@@ -45,7 +49,7 @@ def load_runs(
     recordings = []
     for path in paths:
         with memory.for_runs([path.name]):
-            recordings.append(storage.load(path, sort=sort))
+            recordings.append(run_folder.load(path, sort=sort))
     names = [recording.name for recording in recordings]
     for path, name in zip(paths, names, strict=True):
         if names.count(name) > 1:

@@ -11,8 +11,8 @@ import numpy as np
 import tuning
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import note, print_table, tuning_progress
-from jaxekf.recording import Recording
-from jaxekf.static_noise import read_log
+from jaxekf.io.run_folder import read_log
+from jaxekf.recordings.types import Recording
 
 
 def _number(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:

@@ -5,13 +5,13 @@ from typing import Any
 
 import click
 
-from jaxekf import storage
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json, print_table
 from jaxekf.cli.options import Finite
-from jaxekf.datasets.formats import FORMATS, read
-from jaxekf.description import FILE
-from jaxekf.files import check_output
-from jaxekf.recording import STREAMS, Recording
+from jaxekf.io import run_folder
+from jaxekf.io.atomic import check_output
+from jaxekf.io.importers.formats import FORMATS, read
+from jaxekf.recordings.facts import FILE
+from jaxekf.recordings.types import STREAMS, Recording
 
 _LIST = "\n".join(f"  {name:<10} {one.about}" for name, one in FORMATS.items())
 
@@ -77,7 +77,7 @@ def import_run(
                 f"got {option} with {form}, expected it with {taken} only; leave it out"
             )
     recording = read(form, source, **given)
-    storage.save(recording, output, overwrite=overwrite)
+    run_folder.save(recording, output, overwrite=overwrite)
     note(f"wrote {output}")
     if as_json:
         print_json(_document(recording, form, source, output))

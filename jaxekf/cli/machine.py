@@ -6,8 +6,8 @@ from contextlib import suppress
 import click
 import jax
 
-from jaxekf.errors import CacheError
-from jaxekf.program_cache import keep_programs
+from jaxekf._support.errors import CacheError
+from jaxekf._support.program_cache import keep_programs
 
 
 def prepare() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from jaxekf import parameters, plots
+from jaxekf._support.errors import ModelError
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -16,12 +16,13 @@ from jaxekf.cli.console import (
     wrote,
 )
 from jaxekf.cli.estimate import load_runs
-from jaxekf.errors import ModelError
-from jaxekf.estimation import estimate_many
+from jaxekf.estimation import parameters
+from jaxekf.estimation.batch import estimate_many
+from jaxekf.estimation.result import Estimate
 from jaxekf.models import get_model
-from jaxekf.recording import Recording
-from jaxekf.result import Estimate
-from jaxekf.robust_weights import Means, robust
+from jaxekf.models.robust import Means, robust
+from jaxekf.recordings.types import Recording
+from jaxekf.reporting import plots
 
 FIGURES = tuple(plots.figure_functions())
 

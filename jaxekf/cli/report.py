@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json
-from jaxekf.report import write_report
+from jaxekf.reporting.report import write_report
 
 
 @click.command()

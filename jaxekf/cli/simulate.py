@@ -6,11 +6,12 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from jaxekf import files, simulate_tool, storage
-from jaxekf import simulate as simulator
 from jaxekf.cli.console import json_option, overwrite_option, print_json, wrote
 from jaxekf.cli.options import Finite, Span, hidden, spans
-from jaxekf.recording import Recording
+from jaxekf.io import atomic, run_folder
+from jaxekf.recordings.types import Recording
+from jaxekf.simulation import attitude_runs as simulator
+from jaxekf.simulation import marker_runs
 
 # Options that one kind of motion has no use for: to take them in silence would simulate something else
 # than was asked.
@@ -142,13 +143,13 @@ def simulate(
     """
     _refuse_what_does_not_apply(ctx, motion)
     for number in range(seed, seed + runs):
-        files.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
+        atomic.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
     written = []
     for number in range(seed, seed + runs):
         record = _tool if motion == "tool" else _rotation
         recording = record(motion, number, options)
         folder = output / recording.name
-        written.append(str(storage.save(recording, folder, overwrite=overwrite, digits=10)))
+        written.append(str(run_folder.save(recording, folder, overwrite=overwrite, digits=10)))
         wrote(folder)
     if as_json:
         print_json({"runs": written})
@@ -193,8 +194,8 @@ def _rotation(motion: str, seed: int, options: dict[str, Any]) -> Recording:
 
 def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
     """A run of single markers, gyroscope and accelerometer."""
-    walk, given = options["bias_walk"], simulate_tool.ToolGrade()
-    grade = simulate_tool.ToolGrade(
+    walk, given = options["bias_walk"], marker_runs.ToolGrade()
+    grade = marker_runs.ToolGrade(
         gyroscope_deg=options["gyroscope_noise"],
         accelerometer_mg=options["accelerometer_noise"],
         bias_walk_deg=given.bias_walk_deg if walk is None else walk,
@@ -203,10 +204,10 @@ def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
         marker_mm=options["marker_noise"],
         latency_s=options["latency"],
     )
-    tool = simulate_tool.Tool()
-    return simulate_tool.tool_recording(
+    tool = marker_runs.Tool()
+    return marker_runs.tool_recording(
         f"{motion}-{seed}",
-        simulate_tool.free_tool_motion(seed),
+        marker_runs.free_tool_motion(seed),
         seed=seed,
         duration_s=options["duration"],
         grade=grade,
@@ -215,7 +216,7 @@ def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
     )
 
 
-def _hidden(asked: list[Span], names: tuple[str, ...]) -> simulate_tool.Hidden:
+def _hidden(asked: list[Span], names: tuple[str, ...]) -> marker_runs.Hidden:
     """Marker by marker; a span that names none hides all."""
     found = []
     for span in asked:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import tuning
-from jaxekf import memory, parameters
+from jaxekf._support import memory
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import (
     json_option,
@@ -31,16 +31,17 @@ from jaxekf.cli.folds import (
     print_folds,
     static_option,
 )
-from jaxekf.files import check_output
-from jaxekf.model import Parameters
+from jaxekf.estimation import parameters
+from jaxekf.filtering.model import Parameters
+from jaxekf.io.atomic import check_output
 from jaxekf.models import get_model
-from jaxekf.recording import Recording
-from tuning.frame import TRUTH_UNITS
-from tuning.noise import AXES
-from tuning.objectives import parse
-from tuning.spec import read_free
-from tuning.validation import as_dicts
-from tuning.ways import OPTIMISERS
+from jaxekf.recordings.types import Recording
+from tuning.comparison.compare import as_dicts
+from tuning.objective.objectives import parse
+from tuning.parametrisation.free_toml import read_free
+from tuning.parametrisation.free_vector import AXES
+from tuning.parametrisation.truth_frame import TRUTH_UNITS
+from tuning.search.optimisers import OPTIMISERS
 
 
 @click.command()

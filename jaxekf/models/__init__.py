@@ -5,8 +5,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from jaxekf.errors import ModelError
-from jaxekf.model import Model
+from jaxekf._support.errors import ModelError
+from jaxekf.filtering.model import Model
 from jaxekf.models import (
     loose,
     loose_additive,
@@ -17,7 +17,7 @@ from jaxekf.models import (
     triad,
     visual,
 )
-from jaxekf.recording import Recording
+from jaxekf.recordings.types import Recording
 
 REGISTRY: dict[str, Model] = {
     model.name: model

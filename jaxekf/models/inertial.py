@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, pose, rotation
-from jaxekf.interpolation import InputSample
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Output, Parameters
-from jaxekf.recording import Floats, Optical, Recording
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Output, Parameters
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import Floats, Optical, Recording
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
@@ -162,7 +163,7 @@ def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
     """Free fall (3,) in the reference frame: stated by the recording, or found from its poses `raw()`."""
     stated = recording.info.get("gravity_ref")
     if stated is None:
-        stated = pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
+        stated = marker_pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
     return np.asarray(stated, float)
 
 

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, rotation
-from jaxekf.interpolation import InputSample
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import sources
 
 

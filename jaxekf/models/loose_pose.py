@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, pose, rotation
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import inertial, sources
-from jaxekf.recording import Flags, Optical, Recording, Samples, Times
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import Flags, Optical, Recording, Samples, Times
 
 GATE = 0.999
 
@@ -71,7 +72,7 @@ def pose_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 def raw_pose(recording: Recording) -> Optical:
     """The tracker's pose, or that of the markers where there are only those."""
     if recording.optical is None and recording.markers is not None:
-        return pose.from_markers(recording.markers)
+        return marker_pose.from_markers(recording.markers)
     return recording.need_optical()
 
 
@@ -101,14 +102,14 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     arm = _tracked_point(recording)
     origin = seen.value.position - sources.turned(seen.value.q_ref_body, arm)
     poses = Optical(seen.time_ns, seen.value.q_ref_body, visible, origin)
-    first = pose.first_steady(poses, recording.need_imu())
+    first = marker_pose.first_steady(poses, recording.need_imu())
     if first is None:
         return None
     skipped = int(visible[:first].sum())
     known = {
         "position": origin[first],
         "q_ref_body": seen.value.q_ref_body[first],
-        "velocity": pose.velocity_at(seen.time_ns, origin, visible, first),
+        "velocity": marker_pose.velocity_at(seen.time_ns, origin, visible, first),
     }
     note = (
         f"{skipped} poses at the start do not turn as the gyroscope did, or jump: they are not used"
@@ -121,10 +122,10 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
 def _fits(recording: Recording, taken: Times) -> Flags:
     """Of the poses taken then, those whose markers fit the tool as well as others do."""
     markers = recording.need_markers()
-    fit = pose.fit_markers(markers, recording.path or recording.name)
+    fit = marker_pose.fit_markers(markers, recording.path or recording.name)
     chosen = np.isin(markers.time_ns - markers.latency_ns, taken)
     error, valid = fit.error[chosen], fit.valid[chosen]
-    limit = pose.START_FIT * np.median(error[valid]) if valid.any() else 0.0
+    limit = marker_pose.START_FIT * np.median(error[valid]) if valid.any() else 0.0
     return valid & (error <= limit)
 
 

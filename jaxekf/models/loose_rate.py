@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Model, Output, Parameters, Sensor
+from jaxekf.geometry import linalg
+from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import loose, sources
 
 

@@ -20,12 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import inclination, linalg, rotation
-from jaxekf.interpolation import InputSample
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Input, Model, Output, Parameters, Sensor, Start
-from jaxekf.models import earth, inertial, sources
-from jaxekf.recording import NANOSECONDS, Recording, Samples
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor, Start
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.models import _earth as earth
+from jaxekf.models import inertial, sources
+from jaxekf.pose_solvers import tilt
+from jaxekf.recordings.types import NANOSECONDS, Recording, Samples
 
 START_S = 0.1
 """Seconds whose mean gives the attitude to start from."""
@@ -168,7 +170,7 @@ def magnetometer(recording: Recording) -> Samples:
     """The field (N, 3) in units of its median norm, and by what norm and dip are off."""
     imu = earth.need_both(recording)
     assert imu.magnetometer is not None
-    field = inclination.field(imu)
+    field = tilt.field(imu)
     good = np.isfinite(field.dip)
     rows = earth.thinned(imu, good)
     norm, dip = np.nanmedian(field.norm), np.nanmedian(field.dip)
@@ -193,7 +195,7 @@ def rest(recording: Recording) -> Samples:
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyroscope, axis=0)])
     before = np.concatenate([[-1], rows[:-1]])
     mean = (total[rows + 1] - total[before + 1]) / (rows - before)[:, None]
-    return Samples(imu.time_ns[rows], mean, inclination.still(imu)[rows])
+    return Samples(imu.time_ns[rows], mean, tilt.still(imu)[rows])
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Floats, Markers, Optical, Recording, Samples, to_scipy
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.types import Floats, Markers, Optical, Recording, Samples, to_scipy
 
 
 def optical_attitude(recording: Recording) -> Samples:

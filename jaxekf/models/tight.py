@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, pose, rotation
-from jaxekf.manifold import Euclidean
-from jaxekf.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.manifold import Euclidean
 from jaxekf.models import inertial, sources
-from jaxekf.recording import NANOSECONDS, Recording, Samples
+from jaxekf.pose_solvers import marker_pose
+from jaxekf.recordings.types import NANOSECONDS, Recording, Samples
 
 GATE = 0.999
 
@@ -87,20 +88,20 @@ def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
     places = dict(zip(markers.names, markers.p_body_marker, strict=True))
     # A marker that this recording does not have is never seen: any place will do.
     arms = np.array([places.get(name, np.zeros(3)) for name in names], float)
-    return Setup(*inertial.setup(recording, partial(pose.from_markers, markers)), arms)
+    return Setup(*inertial.setup(recording, partial(marker_pose.from_markers, markers)), arms)
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
     """The first frame in which three markers, not on a line, give a pose; what came before is dropped."""
     times = next(iter(samples.values())).time_ns
     markers = sources.single_markers(recording)
-    fit = pose.fit_markers(markers, recording.path or recording.name)
-    raw = pose.from_markers(markers, fit)
+    fit = marker_pose.fit_markers(markers, recording.path or recording.name)
+    raw = marker_pose.from_markers(markers, fit)
     inside = np.isin(raw.time_ns - raw.latency_ns, times)
     valid = raw.valid & inside
     if not valid.any() or raw.position is None:
         return None
-    valid &= fit.error <= pose.START_FIT * np.median(fit.error[valid])
+    valid &= fit.error <= marker_pose.START_FIT * np.median(fit.error[valid])
     first = int(np.argmax(valid))
     taken = raw.time_ns - raw.latency_ns
     waited = (taken[first] - times[0]) / NANOSECONDS
@@ -113,7 +114,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     known = {
         "position": raw.position[first],
         "q_ref_body": raw.q_ref_body[first],
-        "velocity": pose.velocity_at(taken, raw.position, valid, first),
+        "velocity": marker_pose.velocity_at(taken, raw.position, valid, first),
     }
     return Start(int(taken[first]), known, note)
 

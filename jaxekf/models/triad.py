@@ -1,9 +1,10 @@
 """`triad`: attitude and rate bias, the attitude measured from gravity and the magnetic field.
 
 Ang, Khosla, Riviere, eqs. 19 to 51: the rate of any source (an array of accelerometers, see
-`jaxekf.differential`, or a gyroscope) drives the prediction, and an attitude found from specific force and
-magnetic field (`jaxekf.vectors.triad`, eqs. 7 to 13) corrects it, with the covariance of eqs. 41 to 46.
-The state has 7 numbers and 6 degrees of freedom. `marg` serves better where the body accelerates.
+`jaxekf.pose_solvers.gyro_free_rate`, or a gyroscope) drives the prediction, and an attitude found from
+specific force and magnetic field (`jaxekf.geometry.triad.triad`, eqs. 7 to 13) corrects it, with the
+covariance of eqs. 41 to 46. The state has 7 numbers and 6 degrees of freedom. `marg` serves better
+where the body accelerates.
 
 What is wrong in print, and otherwise here: eqs. 21 and 24 disagree in the quaternion's order; eqs. 28, 30
 and 31 lack the factor T; eq. 47 subtracts the bias twice; eq. 46 has rank 3, so that the error of three
@@ -17,12 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import inclination, linalg, rotation, vectors
-from jaxekf.interpolation import InputSample
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Input, Model, Output, Parameters, Sensor
-from jaxekf.models import earth, inertial, loose, sources
-from jaxekf.recording import Recording, Samples
+from jaxekf.filtering.interpolation import InputSample
+from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.geometry import linalg, rotation, triad
+from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.models import _earth as earth
+from jaxekf.models import inertial, loose, sources
+from jaxekf.pose_solvers import tilt
+from jaxekf.recordings.types import Recording, Samples
 
 
 class State(NamedTuple):
@@ -92,7 +95,7 @@ def predict_attitude(x: State, u: InputSample, params: Parameters, aux: Any) -> 
 def attitude_noise(params: Parameters, aux: Readings, dt: Array) -> Array:
     """Covariance (3, 3) of an attitude of two vectors, rad^2, body frame (eqs. 41 to 46)."""
     force, field = params.noise.accelerometer, params.noise.magnetometer
-    return vectors.triad_covariance(
+    return triad.triad_covariance(
         aux.force, aux.field, linalg.covariance(force, 3), linalg.covariance(field, 3)
     )
 
@@ -101,7 +104,7 @@ def attitude(recording: Recording) -> Samples:
     """Attitudes (N, 4) of each pair of readings; parallel vectors and what was not read are masked."""
     imu, about = earth.need_both(recording), earth.setup(recording)
     assert imu.accelerometer is not None and imu.magnetometer is not None
-    norm = np.nanmedian(inclination.field(imu).norm)
+    norm = np.nanmedian(tilt.field(imu).norm)
     force, field = imu.accelerometer, imu.magnetometer / norm
     found = earth.attitudes(force, field, about)
     valid = np.asarray(found.valid) & np.isfinite(field).all(axis=1)

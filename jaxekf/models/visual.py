@@ -5,9 +5,9 @@ The filter of Hol (2008): 22 numbers, 21 degrees of freedom, eqs. 9 (process), 1
 random walks here with spectral densities; so images and IMU may come at any rates, and either may fail.
 
 A camera's sample has one group of two rows for each of as many landmarks as an image has at most; see
-`jaxekf.model.repeated`. The measurement is the image point itself (reprojection). `visual_bilinear` has
-the thesis' 11c: ``0 = (I, -z) p_camera``, in metres, z the direction of the image point; there the
-point goes into the slope, and its depth into the noise.
+`jaxekf.filtering.model.repeated`. The measurement is the image point itself (reprojection).
+`visual_bilinear` has the thesis' 11c: ``0 = (I, -z) p_camera``, in metres, z the direction of the image
+point; there the point goes into the slope, and its depth into the noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,16 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf import linalg, projection, resection, rotation
-from jaxekf.manifold import SO3, Euclidean
-from jaxekf.model import Model, Output, Parameters, Sensor, repeated
-from jaxekf.models import correspondences, inertial, sources
-from jaxekf.models.correspondences import Point, SeenPoint
-from jaxekf.projection import Lens
-from jaxekf.recording import (
-    Recording,
-    Samples,
-)
+from jaxekf.filtering.model import Model, Output, Parameters, Sensor, repeated
+from jaxekf.geometry import linalg, pinhole, rotation
+from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.geometry.pinhole import Lens
+from jaxekf.models import _correspondences as correspondences
+from jaxekf.models import inertial, sources
+from jaxekf.models._correspondences import Point, SeenPoint
+from jaxekf.pose_solvers import pnp
+from jaxekf.recordings.types import Recording, Samples
 
 GATE = 0.999
 _FEWEST = 8
@@ -180,7 +179,7 @@ def in_camera(x: State, params: Parameters, p_ref_landmark: Array) -> Array:
 
 def predict_point(x: State, u: Any, params: Parameters, aux: Point) -> Array:
     """Eq. 3a: the image point (2,) of a landmark, pixels."""
-    return projection.project(lens_of(params), in_camera(x, params, aux.p_ref_landmark))
+    return pinhole.project(lens_of(params), in_camera(x, params, aux.p_ref_landmark))
 
 
 def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
@@ -191,12 +190,12 @@ def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
 def predict_bilinear(x: State, u: Any, params: Parameters, aux: SeenPoint) -> Array:
     """Eq. 11c: how far (2,), metres, the landmark lies off the ray of its image point, beside the axis."""
     p = in_camera(x, params, aux.p_ref_landmark)
-    return p[:2] - projection.ray(lens_of(params), aux.pixel) * p[2]
+    return p[:2] - pinhole.ray(lens_of(params), aux.pixel) * p[2]
 
 
 def bilinear_noise(params: Parameters, aux: SeenPoint, dt: Array) -> Array:
     """Covariance (2, 2), metres squared: that of the image point at the landmark's depth."""
-    slope = jax.jacfwd(partial(projection.ray, lens_of(params)))(aux.pixel)
+    slope = jax.jacfwd(partial(pinhole.ray, lens_of(params)))(aux.pixel)
     variance = params.noise.pixel**2 + aux.sigma**2
     return variance * aux.depth**2 * linalg.multiply_transposed(slope, slope)
 
@@ -216,7 +215,7 @@ def setup(recording: Recording) -> Setup:
     stream = recording.need_camera()
     turn = np.asarray(stream.q_body_camera, float)
     return Setup(
-        inertial.gravity(recording, lambda: resection.as_optical(stream)),
+        inertial.gravity(recording, lambda: pnp.as_optical(stream)),
         np.asarray(stream.focal, float),
         np.asarray(stream.centre, float),
         np.asarray(stream.radial, float),

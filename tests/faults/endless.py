@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 import jaxekf
-from jaxekf import parameters
-from jaxekf.files import whole_set
+from jaxekf.estimation import parameters
+from jaxekf.estimation.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.io.atomic import whole_set
 from jaxekf.models.loose import MODEL, State
-from jaxekf.recording import Imu, Recording
-from jaxekf.report import write_report
-from jaxekf.result import Estimate, OutputEstimate, SensorRecord
+from jaxekf.recordings.types import Imu, Recording
+from jaxekf.reporting.report import write_report
 
 COUNT = 400
 

@@ -17,8 +17,8 @@ from endless import write
 
 import jaxekf
 from jaxekf.cli import main
-from jaxekf.hashes import hashed, inputs
-from jaxekf.recording import Imu, Recording
+from jaxekf.io.hashes import hashed, inputs
+from jaxekf.recordings.types import Imu, Recording
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 ROOT = Path(__file__).parents[2]

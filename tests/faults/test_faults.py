@@ -15,9 +15,9 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 import jaxekf
-from jaxekf import simulate
+from jaxekf._support.errors import RecordingError
 from jaxekf.cli import main
-from jaxekf.errors import RecordingError
+from jaxekf.simulation import attitude_runs
 
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("folder")
@@ -30,9 +30,9 @@ def source(tmp_path_factory):
 
 
 def made(duration_s=4.0):
-    run = simulate.recording(
+    run = attitude_runs.recording(
         "run",
-        simulate.free_motion(4, speed_deg=60.0, rest_s=0.3),
+        attitude_runs.free_motion(4, speed_deg=60.0, rest_s=0.3),
         seed=4,
         duration_s=duration_s,
         start_ns=1_000 * 10**9,

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxekf import containers
-from jaxekf.errors import RecordingError
-from jaxekf.recording import Encoder, Imu, Markers, Optical, Recording
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import container
+from jaxekf.recordings.types import Encoder, Imu, Markers, Optical, Recording
 
 COUNT = 10_000 if os.environ.get("JAXEKF_LONG") == "1" else 300
 PATIENCE_S = 20.0
@@ -53,8 +53,8 @@ def small_run():
 def write_seeds(folder, suffix):
     """Half of the run as `save` writes it, the other half as another program might: plain, not packed."""
     run = small_run()
-    ours = containers.save(run.replace(encoder=None, markers=None), folder / f"ours{suffix}")
-    other = containers.save(run.replace(imu=None, optical=None), folder / f"other{suffix}")
+    ours = container.save(run.replace(encoder=None, markers=None), folder / f"ours{suffix}")
+    other = container.save(run.replace(imu=None, optical=None), folder / f"other{suffix}")
     plain = folder / f"plain{suffix}"
     data = dict(arrays_of(other))
     if suffix == ".npz":
@@ -173,7 +173,7 @@ def expected_valid(label, there, rows):
 def judge(path):
     """``refused``, ``read``, or what is wrong."""
     try:
-        run = containers.load(path)
+        run = container.load(path)
     except RecordingError as error:
         return "refused" if "\n" not in str(error) else f"two lines: {error}"
     except Exception as error:
@@ -195,7 +195,7 @@ class Worker:
     def judge(self, path):
         if self.process is None:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", WITHOUT_JAX, containers.__file__, __file__],
+                [sys.executable, "-c", WITHOUT_JAX, container.__file__, __file__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -252,7 +252,7 @@ def test_damaged_files(tmp_path, suffix):
 def test_the_independent_reader_tells_a_difference(tmp_path, suffix):
     """Would catch a comparison that never fails: files of other numbers, times and flags differ."""
     run = small_run()
-    path = containers.save(run, tmp_path / f"run{suffix}")
+    path = container.save(run, tmp_path / f"run{suffix}")
     assert judge(path) == "read"
     flags = ~run.optical.valid
     for other in (

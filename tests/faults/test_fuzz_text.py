@@ -10,8 +10,8 @@ import pytest
 from scenario import LONG
 
 import jaxekf
-from jaxekf import simulate
-from jaxekf.errors import RecordingError
+from jaxekf._support.errors import RecordingError
+from jaxekf.simulation import attitude_runs
 
 FILES = ("imu.csv", "optical.csv", "recording.toml")
 NUMBERS = {"imu.csv": ("gx", "gy", "gz"), "optical.csv": ("qw", "qx", "qy", "qz", "x", "y", "z")}
@@ -20,9 +20,9 @@ NUMBERS = {"imu.csv": ("gx", "gy", "gz"), "optical.csv": ("qw", "qx", "qy", "qz"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A short run on disk, with its bytes."""
-    made = simulate.recording(
+    made = attitude_runs.recording(
         "run",
-        simulate.free_motion(1),
+        attitude_runs.free_motion(1),
         seed=1,
         duration_s=0.4,
         start_ns=1_700_000_000_123_456_789,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import jaxekf
-from jaxekf import temporary
-from jaxekf.errors import RecordingError
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _temporary as temporary
 from jaxekf.models.loose import MODEL
-from jaxekf.report.saved import read_result
+from jaxekf.reporting.report._saved import read_result
 
 LONG = os.environ.get("JAXEKF_LONG") == "1"
 ROOT = Path(__file__).parents[2]

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from jaxekf import parameters, temporary
-from jaxekf.errors import RecordingError
-from jaxekf.files import whole_file, whole_folder, whole_set
+from jaxekf._support.errors import RecordingError
+from jaxekf.estimation import parameters
+from jaxekf.io import _temporary as temporary
+from jaxekf.io.atomic import whole_file, whole_folder, whole_set
 from jaxekf.models.loose import MODEL
-from jaxekf.report.tuned import _check_noise
+from jaxekf.reporting.report._tuned import _check_noise
 
 
 def dead():

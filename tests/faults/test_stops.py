@@ -13,13 +13,14 @@ from click.testing import CliRunner
 from endless import estimate as stand_in
 
 import jaxekf
-from jaxekf import memory, storage
+from jaxekf._support import memory
+from jaxekf._support.errors import MissingPackageError, ResourceError
+from jaxekf._support.optional import need
 from jaxekf.cli import main
-from jaxekf.errors import MissingPackageError, ResourceError
-from jaxekf.export import read_export
-from jaxekf.optional import need
-from jaxekf.recording import Imu, Recording
-from jaxekf.report.saved import read_result
+from jaxekf.io import run_folder
+from jaxekf.io.export import read_export
+from jaxekf.recordings.types import Imu, Recording
+from jaxekf.reporting.report._saved import read_result
 
 ROOT = Path(__file__).parents[2]
 # The package has the command under the name of its module.
@@ -96,7 +97,7 @@ def three(tmp_path, monkeypatch):
     paths = []
     for i in range(3):
         imu = Imu(stand_in(0).time_ns, stand_in(0).outputs["rate"].value)
-        paths.append(storage.save(Recording(f"run-{i}", imu=imu), tmp_path / f"run-{i}"))
+        paths.append(run_folder.save(Recording(f"run-{i}", imu=imu), tmp_path / f"run-{i}"))
     monkeypatch.setattr(
         estimate_command, "estimate_many", lambda runs, *a, **o: [stand_in(i) for i in range(3)]
     )
@@ -149,7 +150,7 @@ def test_too_little_memory_names_the_run(three, tmp_path, monkeypatch):
     assert done.exit_code == 1
     assert "run 'run-1': got too little memory (Unable to allocate 7 TiB)" in done.output
     assert "Traceback" not in done.output
-    monkeypatch.setattr(storage, "load", lambda path, **_: breaks())
+    monkeypatch.setattr(run_folder, "load", lambda path, **_: breaks())
     assert "run 'run-0': got too little memory" in call("estimate", *three).output
 
 
@@ -178,7 +179,7 @@ def test_a_full_disk(tmp_path, monkeypatch, error):
     def breaks(*arguments):
         raise error
 
-    monkeypatch.setattr(storage, "write_sheet", breaks)
+    monkeypatch.setattr(run_folder, "write_sheet", breaks)
     done = call("simulate", "--duration", 1, "--rest", 0.2, "-o", tmp_path)
     assert done.exit_code == 1
     expected = (

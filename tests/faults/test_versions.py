@@ -10,12 +10,12 @@ from click.testing import CliRunner
 from endless import estimate
 
 import jaxekf
-from jaxekf import parameters
 from jaxekf.cli import main
+from jaxekf.estimation import parameters
 from jaxekf.models.loose import MODEL
-from jaxekf.report.saved import read_result
-from jaxekf.report.tuned import read_tuning
-from tuning import resume
+from jaxekf.reporting.report._saved import read_result
+from jaxekf.reporting.report._tuned import read_tuning
+from tuning.persistence import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_a_kept_tuning_of_another_version(tmp_path):
     """Would catch the state of a search that an older version wrote and this one goes on from."""
     np.savez(tmp_path / "state", kind="jaxekf tuning, version 2", mark="m")
     with pytest.raises(jaxekf.TuningError, match="another tuning"):
-        resume.read(tmp_path / "state.npz", "m")
+        checkpoint.read(tmp_path / "state.npz", "m")
 
 
 def test_what_is_printed_and_written_for_others(tmp_path):

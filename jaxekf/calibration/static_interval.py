@@ -1,0 +1,222 @@
+"""How long a run rests at its start, and how much a tracker scatters meanwhile."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxekf._support import chi_square
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Flags,
+    Floats,
+    Imu,
+    Markers,
+    Optical,
+    Recording,
+    Times,
+    period_ns,
+    to_scipy,
+)
+
+_WINDOW_S = 0.5
+_REMEMBERED = 120
+"""Windows whose mean is the constant that the next one must keep."""
+_LOUDER = 2.0
+_FLOOR = 1e-3
+"""rad/s: motion below this is not told from noise."""
+_FASTEST_BIAS = np.deg2rad(10.0)
+_QUIETEST = 0.05
+"""Quantile over windows of their scatter: what the sensor's own noise is."""
+_LEAST_HEAD_S = 3.0
+_LATE_S = 0.5
+"""By so much a tracker's clock may be off; this much of the rest's ends is not used."""
+_LONGEST_GAP = 1.5
+_LEAST_SAMPLES = 20
+_OUTLYING = 6.0
+_MEDIAN = 0.6745
+_WANDERS = 1.5
+_TURNS_SIGMAS, _LEAST_TURN = 6.0, np.deg2rad(0.1)
+
+
+class Scatter(NamedTuple):
+    """Standard deviation of a tracker's samples at rest, of three axes, with 95 % intervals."""
+
+    value: Floats
+    """(3,) rad in the body frame, or metres in the reference frame."""
+    low: Floats
+    high: Floats
+    samples: int
+    wander: float
+    """Deviation about the mean over that of neighbours: 1 where samples are independent."""
+
+    @property
+    def wanders(self) -> bool:
+        """Whether samples are plainly not independent: the deviation of neighbours then says too little."""
+        return self.wander > _WANDERS
+
+
+class TrackerNoise(NamedTuple):
+    """A tracker of a tool at rest; None for what it does not tell."""
+
+    optical: Scatter | None
+    position: Scatter | None
+    marker: Scatter | None
+
+
+def static_head(recording: Recording) -> float:
+    """Seconds from the IMU's first sample for which the run rests.
+
+    The gyroscope stays within its own scatter of a constant, half a second at a time. Raises
+    `RecordingError` where that is under 3 s, or where the tracker turns on steadily meanwhile.
+    """
+    place = str(recording.path or recording.name)
+    imu = recording.need_imu()
+    found = quiet_s(imu)
+    if found < _LEAST_HEAD_S:
+        raise RecordingError(
+            place,
+            f"{found:.1f} s of rest at the start",
+            f"{_LEAST_HEAD_S:.0f} s or more in which the gyroscope stays quiet",
+            "a run that begins at rest, or --from and --to of a stretch that rests",
+        )
+    if recording.optical is not None:
+        _need_no_turn(recording.optical, imu, found, place)
+    return found
+
+
+def quiet_s(imu: Imu) -> float:
+    """Seconds from the first sample for which the gyroscope stays quiet; 0 where it does not begin so."""
+    t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
+    label = np.floor(t / _WINDOW_S).astype(int)
+    count = np.bincount(label).astype(float)
+    if len(count) < 2:
+        return 0.0
+    count[-1] = max(count[-1], 1.0)
+    held = np.maximum(count, 1.0)[:, None]
+    mean = np.stack([np.bincount(label, column) for column in imu.gyroscope.T], axis=1) / held
+    off = imu.gyroscope - mean[label]
+    scatter = np.sqrt(np.stack([np.bincount(label, c * c) for c in off.T], axis=1) / held)
+    own = np.quantile(scatter[:-1], _QUIETEST, axis=0) + _FLOOR
+    # A window is compared with those before it, so that motion does not hide itself; not with all of them,
+    # so that a bias may drift over hours.
+    total, row = np.cumsum(mean, axis=0), np.arange(len(mean))
+    far = np.where((row >= _REMEMBERED)[:, None], total[np.maximum(row - _REMEMBERED, 0)], 0.0)
+    before = (total - far) / np.minimum(row + 1, _REMEMBERED)[:, None]
+    quiet = (scatter <= _LOUDER * own).all(axis=1) & (count > 0.0)
+    quiet &= (np.abs(mean) <= _FASTEST_BIAS).all(axis=1)
+    quiet[1:] &= (np.abs(mean[1:] - before[:-1]) <= own).all(axis=1)
+    moving = np.flatnonzero(~quiet)
+    if moving.size == 0:
+        return float(t[-1])
+    # The motion may have begun softly in the window before.
+    return max(0.0, float(moving[0] - 1) * _WINDOW_S)
+
+
+def cut_imu(imu: Imu, begin_s: float, end_s: float) -> Imu:
+    """The samples from `begin_s` to `end_s` seconds after the first."""
+    t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
+    chosen = (t >= begin_s) & (t <= end_s)
+    return replace(
+        imu,
+        time_ns=imu.time_ns[chosen],
+        gyroscope=imu.gyroscope[chosen],
+        accelerometer=None if imu.accelerometer is None else imu.accelerometer[chosen],
+        magnetometer=None if imu.magnetometer is None else imu.magnetometer[chosen],
+    )
+
+
+def tracker_noise(
+    recording: Recording, begin_s: float, end_s: float, last_s: float
+) -> TrackerNoise:
+    """Scatter of the tracker while the run rests, from `begin_s` to `end_s` of the IMU's time.
+
+    From the differences of neighbours, so that a slow drift does not count; half a second is left out at
+    ends that are not those of the run, which takes `last_s`.
+    """
+    start = recording.need_imu().time_ns[0]
+    begin = begin_s + _LATE_S if begin_s > 0.0 else -np.inf
+    end = end_s - _LATE_S if end_s < last_s else np.inf
+    optical = position = marker = None
+    if recording.optical is not None:
+        stream = recording.optical
+        t = (stream.time_ns - stream.latency_ns - start) / NANOSECONDS
+        seen = stream.valid & (t >= begin) & (t <= end)
+        optical = _attitude_scatter(stream, seen)
+        if stream.position is not None:
+            position = _scatter([stream.position], stream.time_ns, [seen])
+    if recording.markers is not None:
+        marker = _marker_scatter(recording.markers, start, begin, end)
+    return TrackerNoise(optical, position, marker)
+
+
+def _attitude_scatter(stream: Optical, seen: Flags) -> Scatter | None:
+    """Of rotation vectors from the first seen attitude, body frame: small where all rests."""
+    if seen.sum() < _LEAST_SAMPLES:
+        return None
+    attitude = to_scipy(stream.q_ref_body)
+    middle = to_scipy(stream.q_ref_body[seen]).mean()
+    return _scatter([(middle.inv() * attitude).as_rotvec()], stream.time_ns, [seen])
+
+
+def _marker_scatter(markers: Markers, start: int, begin: float, end: float) -> Scatter | None:
+    t = (markers.time_ns - markers.latency_ns - start) / NANOSECONDS
+    inside = (t >= begin) & (t <= end)
+    count = len(markers.names)
+    places = [markers.position[:, i] for i in range(count)]
+    return _scatter(places, markers.time_ns, [markers.usable[:, i] & inside for i in range(count)])
+
+
+def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter | None:
+    """Of several series (N, 3) of one deviation: half the mean square of differences of neighbours.
+
+    Of ``n`` differences that has ``2 n^2 / (3 n - 1)`` degrees of freedom (von Neumann). Differences far
+    beyond the others are outliers and are left out.
+    """
+    steps, about = [], []
+    for value, valid in zip(values, seen, strict=True):
+        rows = np.flatnonzero(valid)
+        near = np.diff(time_ns[rows]) <= _LONGEST_GAP * period_ns(time_ns)
+        steps.append(np.diff(value[rows], axis=0)[near])
+        if rows.size:
+            about.append(value[rows] - np.median(value[rows], axis=0))
+    step = np.concatenate(steps)
+    if len(step) < _LEAST_SAMPLES:
+        return None
+    size = np.median(np.abs(step), axis=0) / _MEDIAN
+    step = step[(np.abs(step) <= _OUTLYING * np.maximum(size, 1e-12)).all(axis=1)]
+    if len(step) < _LEAST_SAMPLES:
+        return None
+    found = np.sqrt(0.5 * np.mean(np.square(step), axis=0))
+    freedom = 2.0 * len(step) ** 2 / (3.0 * len(step) - 1.0)
+    whole = np.median(np.abs(np.concatenate(about)), axis=0) / _MEDIAN
+    return Scatter(
+        found,
+        found * np.sqrt(freedom / chi_square.ppf(0.975, freedom)),
+        found * np.sqrt(freedom / chi_square.ppf(0.025, freedom)),
+        len(step),
+        float(np.max(whole / np.maximum(found, 1e-15))),
+    )
+
+
+def _need_no_turn(optical: Optical, imu: Imu, end_s: float, place: str) -> None:
+    """A steady turn looks to a gyroscope like a bias; the tracker knows better."""
+    t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
+    thirds = [
+        optical.valid & (t >= share * end_s) & (t <= (share + 1.0 / 3.0) * end_s - _LATE_S / 2.0)
+        for share in (0.0, 0.6)
+    ]
+    if min(third.sum() for third in thirds) < _LEAST_SAMPLES:
+        return
+    first, last = (to_scipy(optical.q_ref_body[third]) for third in thirds)
+    turned = float((first.mean().inv() * last.mean()).magnitude())
+    own = float(np.sqrt(np.mean((first.mean().inv() * first).magnitude() ** 2)))
+    bound = max(_TURNS_SIGMAS * own / np.sqrt(_LEAST_SAMPLES), _LEAST_TURN)
+    if turned > bound:
+        raise RecordingError(
+            place,
+            f"a tracker that turns by {np.rad2deg(turned):.2f} deg in the first {end_s:.1f} s",
+            "a run that rests at its start",
+            "--from and --to of a stretch that rests",
+        )

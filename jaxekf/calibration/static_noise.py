@@ -1,0 +1,231 @@
+"""What the rest of a run, or a static log, tells of the noise of its sensors, as a start for tuning."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration import static_interval
+from jaxekf.calibration.allan import Curve, ImuNoise, SensorNoise, imu_noise
+from jaxekf.calibration.noise_densities import Estimated
+from jaxekf.calibration.static_interval import TrackerNoise
+from jaxekf.filtering.model import Model, Parameters
+from jaxekf.recordings.types import NANOSECONDS, Floats, Recording
+
+AXES = ("x", "y", "z")
+_COLUMN_UNITS = {"rad/s": "rad_s", "m/s^2": "m_s2"}
+
+
+class StaticNoise(NamedTuple):
+    """Noise of the sensors of a run at rest."""
+
+    run: str
+    begin_s: float
+    """Seconds from the IMU's first sample."""
+    end_s: float
+    imu: ImuNoise
+    tracker: TrackerNoise
+
+    @property
+    def sensors(self) -> dict[str, SensorNoise]:
+        """Gyroscope, and accelerometer where there is one."""
+        found = {"gyroscope": self.imu.gyroscope}
+        if self.imu.accelerometer is not None:
+            found["accelerometer"] = self.imu.accelerometer
+        return found
+
+
+class Start(NamedTuple):
+    """Parameters to tune from."""
+
+    params: Parameters
+    """The model's defaults, with the noise that was found."""
+    taken: tuple[str, ...]
+    """Names of the noise that was found."""
+    sentences: tuple[str, ...]
+    """What was not found, and what to beware of."""
+
+
+def static_noise(
+    recording: Recording, begin_s: float | None = None, end_s: float | None = None
+) -> StaticNoise:
+    """Noise from `begin_s` to `end_s`, seconds from the IMU's first sample; without either from the time
+    that the run rests at its start. Raises `RecordingError` where that is too short: `rest.static_head`.
+    """
+    imu = recording.need_imu()
+    last = float(imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
+    if begin_s is None and end_s is None:
+        begin, end = 0.0, static_interval.static_head(recording)
+    else:
+        begin, end = begin_s or 0.0, min(last, last if end_s is None else end_s)
+        if begin >= end:
+            raise RecordingError(
+                str(recording.path or recording.name),
+                f"the stretch from {begin:g} to {end:g} s",
+                f"one within the {last:g} s of the run",
+                "another --from and --to",
+            )
+    found = imu_noise(static_interval.cut_imu(imu, begin, end), recording.path or recording.name)
+    return StaticNoise(
+        recording.name,
+        begin,
+        end,
+        found,
+        static_interval.tracker_noise(recording, begin, end, last),
+    )
+
+
+def start_for(model: Model, found: StaticNoise) -> Start:
+    """The model's defaults with the noise that was found, axis by axis.
+
+    A bias walk that the rest is too short to tell keeps its default, or the upper end of its interval
+    where that is less.
+    """
+    noise, units = model.parameters.noise, model.units.noise
+    known = _known(found)
+    changes: dict[str, Any] = {}
+    sentences = []
+    for name, (value, unit) in known.items():
+        # The same name in another unit is another thing, such as a deviation of samples.
+        if unit != getattr(units, name, None):
+            continue
+        if not np.all(value > 0.0):
+            sentences.append(
+                f"{name} is zero on an axis, which no filter takes: the default is kept"
+            )
+            continue
+        changes[name] = value
+    for name, sensor in _walks(found).items():
+        if name in noise._fields and "walk" in name:
+            value, text = _walk(name, sensor, np.asarray(getattr(noise, name), float), found)
+            if value is not None:
+                changes[name] = value
+            sentences += text
+    for label, sensor in found.sensors.items():
+        bands, half = [made.band_hz for made in sensor.axes], 0.5 / sensor.curve.tau[0]
+        if min(bands) < 0.9 * half and label in changes:
+            sentences.append(
+                f"{label}: densities hold up to {min(bands):.2g} Hz; from there to {half:.3g} Hz the noise"
+                " is not white"
+            )
+    for label, scatter in found.tracker._asdict().items():
+        if scatter is not None and scatter.wanders and label in changes:
+            sentences.append(
+                f"{label}: about their mean samples scatter {scatter.wander:.1f} times more than from one"
+                " to the next: they are filtered or drift, and what a filter needs lies between"
+            )
+    params = model.parameters._replace(noise=noise._replace(**changes))
+    return Start(params, tuple(changes), tuple(sentences))
+
+
+def _known(found: StaticNoise) -> dict[str, tuple[Floats, str]]:
+    """Deviations and densities by the names that models give them, with their units."""
+    known = {
+        name: (sensor.white, f"{sensor.unit}/sqrt(Hz)") for name, sensor in found.sensors.items()
+    }
+    for name, unit in (("optical", "rad"), ("position", "m"), ("marker", "m")):
+        scatter = getattr(found.tracker, name)
+        if scatter is not None:
+            known[name] = (scatter.value, unit)
+    return known
+
+
+def _walks(found: StaticNoise) -> dict[str, SensorNoise]:
+    names = {"gyroscope": "bias_walk", "accelerometer": "accelerometer_walk"}
+    return {names[label]: sensor for label, sensor in found.sensors.items()}
+
+
+def _walk(
+    name: str, sensor: SensorNoise, default: Floats, found: StaticNoise
+) -> tuple[Floats | None, list[str]]:
+    """The walk of each axis where it was found, and a sentence on those where it was not."""
+    walks = [axis.walk_alone for axis in sensor.axes]
+    told = np.array([walk.found for walk in walks])
+    if told.all():
+        return np.array([walk.value for walk in walks]), []
+    high = np.array([walk.high for walk in walks])
+    usual = np.broadcast_to(default if default.ndim < 2 else np.diagonal(default), (3,))
+    value = np.where(told, [walk.value for walk in walks], np.minimum(usual, high))
+    limits = ", ".join(
+        f"{shown(high[i], sensor.unit, '/s/√Hz')} ({AXES[i]})" for i in np.flatnonzero(~told)
+    )
+    kept = "the default is kept" if np.all(usual <= high) else "no more is taken"
+    sentence = (
+        f"{name}: {found.imu.duration_s:.0f} s do not tell a random walk of the bias, only that it is below"
+        f" {limits}; {kept}"
+    )
+    unchanged = not told.any() and bool(np.all(usual <= high))
+    return (None if unchanged or not np.all(value > 0.0) else value), [sentence]
+
+
+def shown(value: float, unit: str, suffix: str) -> str:
+    """A number with its unit for people: degrees for radians."""
+    if unit.startswith("rad"):
+        value, unit = float(np.rad2deg(value)), unit.replace("rad", "deg", 1)
+    return f"{value:.2g} {_pretty(unit + suffix)}"
+
+
+def _pretty(unit: str) -> str:
+    return unit.replace("/s/s", "/s²").replace("m/s^2/s", "m/s³").replace("^2", "²")
+
+
+def curve_table(found: StaticNoise) -> tuple[list[str], Floats]:
+    """The Allan deviation as columns: `tau_s`, then of every sensor and axis deviation, low and high, the
+    unit in each name."""
+    columns, values = ["tau_s"], [found.imu.gyroscope.curve.tau[:, None]]
+    for label, sensor in found.sensors.items():
+        unit = _COLUMN_UNITS[sensor.unit]
+        for i, axis in enumerate(AXES):
+            columns += [f"{label}_{axis}{part}_{unit}" for part in ("", "_low", "_high")]
+            values += [getattr(sensor.curve, part)[:, [i]] for part in Curve._fields[1:]]
+    return columns, np.concatenate(values, axis=1)
+
+
+def as_dict(found: StaticNoise) -> dict[str, Any]:
+    """All of it as a JSON document, in SI units, without the curve."""
+    document: dict[str, Any] = {
+        "run": found.run,
+        "begin_s": found.begin_s,
+        "end_s": found.end_s,
+        "samples": found.imu.samples,
+        "samples_interpolated": found.imu.missing,
+    }
+    for label, sensor in found.sensors.items():
+        floor, at = sensor.floor()
+        document[label] = {"unit": sensor.unit}
+        for i, axis in enumerate(AXES):
+            made = sensor.axes[i]
+            document[label][axis] = {
+                "white": _interval(made.white),
+                "walk": _interval(made.walk),
+                "walk_standing_for_flicker": _interval(made.walk_alone),
+                "flicker": made.flicker,
+                "quantisation": made.quantisation,
+                "floor": float(floor[i]),
+                "floor_at_s": float(at[i]),
+                "fitted_up_to_hz": made.band_hz,
+            }
+    for label, scatter in found.tracker._asdict().items():
+        if scatter is not None:
+            document[label] = {
+                "unit": "rad" if label == "optical" else "m",
+                "deviation": scatter.value.tolist(),
+                "low": scatter.low.tolist(),
+                "high": scatter.high.tolist(),
+                "differences": scatter.samples,
+                "wander": scatter.wander,
+            }
+    return document
+
+
+def _interval(estimated: Estimated) -> dict[str, Any]:
+    return estimated._asdict() | {"found": estimated.found}
+
+
+def write_curve(path: Path, found: StaticNoise) -> None:
+    """Write `curve_table` as a CSV file."""
+    columns, values = curve_table(found)
+    rows: Sequence[str] = [",".join(f"{value:.9g}" for value in row) for row in values]
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")

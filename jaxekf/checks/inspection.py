@@ -1,0 +1,304 @@
+"""What a recorded run holds and whether it can be used as it is: samples, gaps, clocks and units."""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.calibration.alignment import RunAlignment, align_run, drifts, is_late, turned_deg
+from jaxekf.checks._camera_agreement import (
+    CameraEvidence,
+    camera_evidence,
+    camera_warnings,
+    check_camera,
+)
+from jaxekf.checks.plausibility import FARTHEST_M, Evidence, check, evidence
+from jaxekf.checks.sensor_agreement import overlap_s
+from jaxekf.recordings.types import NANOSECONDS, STREAMS, Flags, Recording, Times
+
+GAP = 1.5
+"""Median steps from which on a step is a gap."""
+_LONG_IMU_GAP_S = 0.5
+_GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
+_STANDARD = 9.80665
+_SEEN_TOO_LITTLE = 0.5
+_EXPECTED = ("blank", "hidden", "missing tool", "status ")
+"""What begins so is masked in good recordings, too: the tool was hidden."""
+
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Where nothing stands."""
+
+    count: int
+    longest_s: float
+    lost_s: float
+    """Sum of the steps over the gaps."""
+    spans: list[Span]
+    """Begin and end, seconds on the recording's clock."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"count": self.count, "longest_s": self.longest_s, "lost_s": self.lost_s}
+
+
+class StreamFound(NamedTuple):
+    """One stream, or one marker of a tool."""
+
+    samples: int
+    usable: int
+    rate_hz: float
+    """By the median step; NaN of one sample."""
+    begin_s: float
+    """Seconds on the recording's clock, latency taken off."""
+    end_s: float
+    gaps: Gaps
+    """Steps of more than 1.5 times the median between the stamps of samples, usable or not."""
+    hidden: Gaps
+    """Stretches of samples that are there and not usable."""
+    masked: dict[str, int]
+    """Rows by reason; where none were read, samples that are not valid."""
+    dropped: dict[str, int]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        document = self._asdict() | {"gaps": self.gaps.as_dict(), "hidden": self.hidden.as_dict()}
+        return document | {"duration_s": self.end_s - self.begin_s}
+
+
+class PointsFound(NamedTuple):
+    """Landmarks in the images of a camera."""
+
+    landmarks: int
+    images: int
+    points_per_image: float
+    """Usable ones, on average over all images."""
+    images_without_points: int
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found of one run."""
+
+    run: str
+    streams: dict[str, StreamFound]
+    evidence: Evidence
+    alignment: RunAlignment | None
+    """None where the run does not tell it, or has nothing to align."""
+    faults: tuple[str, ...] = ()
+    """What forbids using the run as it is."""
+    warnings: tuple[str, ...] = ()
+    """What should be looked at before."""
+    notes: tuple[str, ...] = ()
+    """What is as it is in good runs, too."""
+    markers: dict[str, StreamFound] = field(default_factory=dict)
+    """Single markers by their names."""
+    points: PointsFound | None = None
+    """None without a camera."""
+    camera: CameraEvidence | None = None
+    """None also where no image has landmarks enough for a pose."""
+
+    @property
+    def verdict(self) -> str:
+        """``fine``, ``warnings`` or ``faults``."""
+        return "faults" if self.faults else "warnings" if self.warnings else "fine"
+
+
+def inspect(recording: Recording) -> Inspection:
+    """Look at a run; nothing that is found raises."""
+    streams = {
+        label: _stream(recording, label)
+        for label in STREAMS
+        if getattr(recording, label) is not None
+    }
+    found = evidence(recording)
+    faults, warnings, notes = [], [], []
+    try:
+        check(recording, found)
+    except RecordingError as error:
+        faults.append(str(error))
+    aligned, seen = None, camera_evidence(recording)
+    if seen is not None and not faults:
+        try:
+            check_camera(recording, seen)
+        except RecordingError as error:
+            faults.append(str(error))
+    tracked = recording.optical is not None or recording.markers is not None
+    if recording.imu is None or not (tracked or seen is not None):
+        lacking = "IMU" if recording.imu is None else "tracker"
+        notes.append(f"without {lacking} neither clocks nor units can be compared")
+    elif tracked and not faults:
+        try:
+            aligned = align_run(recording)
+        except RecordingError as error:
+            warnings.append(f"clock and frame are not told: {error}")
+    for label in streams:
+        _accounted(recording, label, warnings, notes)
+    warnings += _of_time(streams, found)
+    warnings += [] if aligned is None else _of_clocks(aligned)
+    warnings += [] if faults else _of_units(recording, found)
+    warnings += [] if faults or seen is None else camera_warnings(seen)
+    return Inspection(
+        recording.name,
+        streams,
+        found,
+        aligned,
+        tuple(faults),
+        tuple(warnings),
+        tuple(notes),
+        _markers(recording),
+        _points(recording),
+        seen,
+    )
+
+
+def _stream(recording: Recording, label: str) -> StreamFound:
+    stream: Any = getattr(recording, label)
+    usable = np.ones(len(stream.time_ns), bool)
+    if label in ("optical", "encoder"):
+        usable = stream.valid
+    elif label in ("markers", "camera"):
+        usable = stream.usable.any(axis=1)
+    account = recording.intake.get(label)
+    masked, dropped = {}, {}
+    if account is not None:
+        masked = {name: reason.count for name, reason in account.masked.items()}
+        dropped = {name: reason.count for name, reason in account.dropped.items()}
+    elif not usable.all():
+        masked = {"not valid": int((~usable).sum())}
+    return _found(stream.time_ns - getattr(stream, "latency_ns", 0), usable, masked, dropped)
+
+
+def _markers(recording: Recording) -> dict[str, StreamFound]:
+    markers = recording.markers
+    if markers is None:
+        return {}
+    time_ns = markers.time_ns - markers.latency_ns
+    return {
+        name: _found(time_ns, markers.usable[:, i], _hidden(markers.usable[:, i]), {})
+        for i, name in enumerate(markers.names)
+    }
+
+
+def _points(recording: Recording) -> PointsFound | None:
+    camera = recording.camera
+    if camera is None:
+        return None
+    count = camera.usable.sum(axis=1)
+    return PointsFound(len(camera.names), len(count), float(count.mean()), int((count == 0).sum()))
+
+
+def _hidden(usable: Flags) -> dict[str, int]:
+    return {} if usable.all() else {"hidden": int((~usable).sum())}
+
+
+def _found(
+    time_ns: Times, usable: Flags, masked: dict[str, int], dropped: dict[str, int]
+) -> StreamFound:
+    step = float(np.median(np.diff(time_ns))) / NANOSECONDS if len(time_ns) > 1 else np.nan
+    return StreamFound(
+        len(time_ns),
+        int(usable.sum()),
+        1.0 / step if step > 0.0 else np.nan,
+        float(time_ns[0]) / NANOSECONDS,
+        float(time_ns[-1]) / NANOSECONDS,
+        find_gaps(time_ns),
+        _stretches(time_ns, ~usable),
+        masked,
+        dropped,
+    )
+
+
+def find_gaps(time_ns: Times) -> Gaps:
+    """Steps of more than 1.5 times the median."""
+    step = np.diff(time_ns)
+    if step.size == 0:
+        return Gaps(0, 0.0, 0.0, [])
+    at = np.flatnonzero(step > GAP * np.median(step))
+    return _gaps(time_ns, at, at + 1)
+
+
+def _stretches(time_ns: Times, bad: Flags) -> Gaps:
+    """Stretches of bad samples, each from its first to the next good one, or to the last."""
+    edges = np.flatnonzero(np.diff(np.r_[False, bad, False].astype(int)))
+    return _gaps(time_ns, edges[::2], np.minimum(edges[1::2], len(time_ns) - 1))
+
+
+def _gaps(time_ns: Times, begin: Any, end: Any) -> Gaps:
+    lost = (time_ns[end] - time_ns[begin]) / NANOSECONDS
+    ends = zip(time_ns[begin].tolist(), time_ns[end].tolist(), strict=True)
+    spans = [(a / NANOSECONDS, b / NANOSECONDS) for a, b in ends]
+    return Gaps(len(spans), float(lost.max(initial=0.0)), float(lost.sum()), spans)
+
+
+def _accounted(recording: Recording, label: str, warnings: list[str], notes: list[str]) -> None:
+    """What became of rows, in the words of their account: hidden tools are noted, all else is a warning."""
+    account = recording.intake.get(label)
+    if account is None:
+        return
+    count = len(account.masked)
+    for i, text in enumerate(account.sentences(label)):
+        name = list(account.masked)[i] if i < count else ""
+        (notes if name.startswith(_EXPECTED) else warnings).append(text)
+
+
+def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
+    warnings = []
+    imu = streams.get("imu")
+    long = [b - a for a, b in imu.gaps.spans if b - a > _LONG_IMU_GAP_S] if imu else []
+    if long:
+        warnings.append(
+            f"the IMU has {len(long)} gaps of more than {_LONG_IMU_GAP_S:g} s, the longest of"
+            f" {max(long):.2f} s: what is estimated within is made up"
+        )
+    for label, name in (("optical", "tracker"), ("markers", "tracker"), ("camera", "camera")):
+        seeing = streams.get(label)
+        if seeing is None:
+            continue
+        span = max(seeing.end_s - seeing.begin_s, 1e-9)
+        unseen = (seeing.gaps.lost_s + seeing.hidden.lost_s) / span
+        if unseen > _SEEN_TOO_LITTLE:
+            warnings.append(f"the {name} sees nothing for {100.0 * unseen:.0f} % of its time")
+        overlap = overlap_s(found.ranges_s, label)
+        if 0.0 <= overlap < _SEEN_TOO_LITTLE * span:
+            warnings.append(
+                f"{name} and IMU overlap for {overlap:.1f} s of the {name}'s {span:.1f} s"
+            )
+    return warnings
+
+
+def _of_clocks(aligned: RunAlignment) -> list[str]:
+    made = aligned.tracker
+    warnings = list(aligned.notes)
+    if is_late(made) and not drifts(made):
+        warnings.append(
+            f"the tracker's samples are {1e3 * made.latency_s:.1f} ms older than stamped, by the IMU's"
+            " clock: jaxekf align writes a calibration that makes it good"
+        )
+    if (turned := turned_deg(made)) is not None:
+        warnings.append(
+            f"the tracked frame is turned by {turned[0]:.1f} deg against the IMU's: jaxekf align"
+            " writes a calibration that makes it good"
+        )
+    return warnings
+
+
+def _of_units(recording: Recording, found: Evidence) -> list[str]:
+    """Numbers that no unit explains, and are not what they should be."""
+    warnings = []
+    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [_STANDARD])))
+    at_rest = found.static_scatter < _GRAVITY_OFF
+    if at_rest and abs(found.static_norm / max(gravity, 1e-9) - 1.0) > _GRAVITY_OFF:
+        warnings.append(
+            f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest, where gravity is {gravity:.2f}"
+        )
+    if abs(found.rate_ratio - 1.0) > _RATE_OFF:
+        warnings.append(f"the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker")
+    if found.farthest > FARTHEST_M:
+        warnings.append(
+            f"the tool is up to {found.farthest:.3g} m from the reference's origin: are these metres?"
+        )
+    return warnings

@@ -1,0 +1,262 @@
+"""What tracker and IMU of a recording say of its units, the order of its quaternion and its time.
+
+Measured, not judged: `plausible` judges. What the streams do not tell is NaN.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from jaxekf.calibration import motion_agreement
+from jaxekf.calibration.motion_agreement import Fit, Turns
+from jaxekf.pose_solvers.marker_pose import from_markers
+from jaxekf.recordings.accounts import Indices
+from jaxekf.recordings.facts import BODY_TO_REFERENCE
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    STREAMS,
+    Floats,
+    Imu,
+    Markers,
+    Optical,
+    Recording,
+    Times,
+)
+
+ALIKE = 0.8
+"""Correlation from which on a ratio is that of one motion."""
+EXPLAINED = 0.9
+"""Share of the turning that a right reading explains."""
+DEGREES = 180.0 / np.pi
+_WINDOWS, _QUIETEST = 200, 5
+_MARKER_PAIRS = 1500
+_FRAMES = 2000
+_ORDERS = {"w,x,y,z": "x,y,z,w", "x,y,z,w": "w,x,y,z"}
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What was measured of a recording; NaN for what it does not tell."""
+
+    turns: int = 0
+    """Turns of the tracker that were compared with the gyroscope."""
+    rate: float = np.nan
+    """Root mean square rate of the tracker, rad/s."""
+    second_axis: float = np.nan
+    """Turning about a second axis beside the first, by the gyroscope, in squares: 0 to 1."""
+    lag_s: float = np.nan
+    """At which both turn alike fast, to 5 ms; `alignment` tells it well."""
+    rate_ratio: float = np.nan
+    """The gyroscope's rate to the tracker's: 1, or 57.3 where deg/s were taken for rad/s."""
+    rate_correlation: float = np.nan
+    """Of the turns as vectors, in the order and direction of the quaternion that fits best."""
+    explained: float = np.nan
+    """Share of the tracker's turning that the gyroscope explains, frames aligned."""
+    readings: dict[str, Fit] = field(default_factory=dict)
+    """The same were the quaternion in another order, or of the other direction."""
+    static_norm: float = np.nan
+    """The accelerometer's in the quietest seconds, m/s^2."""
+    static_scatter: float = np.nan
+    """Deviation of that norm over it."""
+    mean_force_ref: tuple[float, ...] = (np.nan, np.nan, np.nan)
+    """Mean of the accelerometer's readings in the reference frame, m/s^2, of any motion."""
+    length_ratio: float = np.nan
+    """The tracker's acceleration to the accelerometer's, or the markers' distances to the geometry's."""
+    length_correlation: float = np.nan
+    """1 for markers."""
+    acceleration: float = np.nan
+    """Root mean square of the tracker's over 0.2 s, m/s^2."""
+    farthest: float = np.nan
+    """Distance of the tool from the reference's origin that 95 % of poses stay within, m."""
+    ranges_s: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """First and last time of each stream, latency taken off, s."""
+    overlap_s: float = np.nan
+    """Of tracker and IMU; negative where one ends before the other begins."""
+
+    @property
+    def mean_force(self) -> float:
+        """Norm of `mean_force_ref`."""
+        return float(np.linalg.norm(self.mean_force_ref))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON; angles in degrees."""
+        told = {name: found.share for name, found in self.readings.items()}
+        return {
+            "turns": self.turns,
+            "rate_deg_s": self.rate * DEGREES,
+            "second_axis": self.second_axis,
+            "lag_s": self.lag_s,
+            "rate_ratio": self.rate_ratio,
+            "rate_correlation": self.rate_correlation,
+            "explained": self.explained,
+            "explained_otherwise": told,
+            "static_norm": self.static_norm,
+            "mean_force": self.mean_force,
+            "mean_force_ref": list(self.mean_force_ref),
+            "length_ratio": self.length_ratio,
+            "length_correlation": self.length_correlation,
+            "ranges_s": {name: list(ends) for name, ends in self.ranges_s.items()},
+            "overlap_s": self.overlap_s,
+        }
+
+
+def evidence(recording: Recording) -> Evidence:
+    """What tracker and IMU of a run say of units, order and time; quick, for a run of any length."""
+    tracker, imu = recording.optical or recording.markers, recording.imu
+    told: dict[str, Any] = {"ranges_s": _ranges(recording)}
+    if imu is not None:
+        told["static_norm"], told["static_scatter"] = static_norm(imu)
+    if isinstance(tracker, Markers):
+        told["length_ratio"] = marker_ratio(tracker)
+        told["length_correlation"] = 1.0 if np.isfinite(told["length_ratio"]) else np.nan
+    if tracker is None or imu is None:
+        return Evidence(**told)
+    told["overlap_s"] = overlap_s(told["ranges_s"], tracker_label(recording))
+    if isinstance(tracker, Optical):
+        rows = np.flatnonzero(tracker.valid)
+        valid = tracker.valid.copy()
+        valid[rows[motion_agreement.strays(tracker.q_ref_body[rows])]] = False
+        tracker = replace(tracker, valid=valid)
+    made = _turns(tracker, imu)
+    if made is None:
+        return Evidence(**told)
+    stated, others = motion_agreement.fit(made.tracker, made.gyroscope), {}
+    if isinstance(tracker, Optical):
+        others = motion_agreement.readings(made, _other_readings(recording))
+    best = max([stated, *others.values()], key=lambda found: found.share)
+    told |= {
+        "turns": len(made.span),
+        "rate": float(np.sqrt(np.mean(np.sum(made.tracker**2, axis=1) / made.span**2))),
+        "second_axis": motion_agreement.second_axis(made.gyroscope),
+        "lag_s": made.lag_s,
+        "rate_ratio": best.ratio if np.sqrt(best.share) > ALIKE else np.nan,
+        "rate_correlation": float(np.sqrt(best.share)),
+        "explained": stated.share,
+        "readings": others,
+    }
+    if stated.share > EXPLAINED:
+        told["mean_force_ref"] = tuple(
+            motion_agreement.mean_force(made, imu, stated.frame).tolist()
+        )
+    if isinstance(tracker, Optical):
+        told |= _lengths(tracker, imu, made, stated)
+    return Evidence(**told)
+
+
+def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
+    found = {}
+    for label in STREAMS:
+        stream = getattr(recording, label)
+        if stream is not None:
+            late = getattr(stream, "latency_ns", 0)
+            first, last = int(stream.time_ns[0]) - late, int(stream.time_ns[-1]) - late
+            found[label] = (first / NANOSECONDS, last / NANOSECONDS)
+    return found
+
+
+def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
+    """How long a stream and the IMU overlap; negative where one ends before the other begins, NaN where one
+    is not there."""
+    if label not in ranges_s or "imu" not in ranges_s:
+        return np.nan
+    one, other = ranges_s["imu"], ranges_s[label]
+    return min(one[1], other[1]) - max(one[0], other[0])
+
+
+def tracker_label(recording: Recording) -> str:
+    """Which stream the tracker is."""
+    return "optical" if recording.optical is not None else "markers"
+
+
+def _turns(tracker: Optical | Markers, imu: Imu) -> Turns | None:
+    if isinstance(tracker, Optical):
+        rows = np.flatnonzero(tracker.valid)
+        t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
+        return motion_agreement.turns(t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu)
+    rows = np.flatnonzero(tracker.usable.sum(axis=1) >= 3)
+    t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
+
+    def attitude(chosen: Indices) -> Floats:
+        return from_markers(some_frames(tracker, rows[chosen])).q_ref_body
+
+    return motion_agreement.turns(t, attitude, imu, _MARKER_PAIRS)
+
+
+def _since(time_ns: Times, imu: Imu) -> Floats:
+    return (time_ns - imu.time_ns[0]) / NANOSECONDS
+
+
+def some_frames(markers: Markers, rows: Indices) -> Markers:
+    """Some frames of single markers, what is not usable hidden."""
+    return Markers(
+        markers.time_ns[rows],
+        markers.position[rows],
+        markers.usable[rows],
+        markers.names,
+        markers.p_body_marker,
+    )
+
+
+def _other_readings(recording: Recording) -> dict[str, motion_agreement.Reading]:
+    """What the quaternion may be instead, by the entry of `recording.toml` that would say so."""
+    about = recording.info.get("optical_about", {})
+    said = [part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")]
+    order = ",".join([part for part in said if len(part) == 1] or "wxyz")
+    direction = next((part for part in said if len(part) > 1), "body to reference")
+    turned = "reference to body" if direction == "body to reference" else "body to reference"
+    found: dict[str, motion_agreement.Reading] = {
+        f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
+    }
+    if order in _ORDERS:
+        # What was stated scalar first is scalar last: its numbers moved on by one; or the other way round.
+        shift = 1 if order == "w,x,y,z" else -1
+        sign = np.array([1.0, -1.0, -1.0, -1.0]) if direction == "reference to body" else 1.0
+        found[f"{_ORDERS[order]}, {direction}"] = lambda q: np.roll(q * sign, shift, axis=1) * sign
+    return found
+
+
+def static_norm(imu: Imu) -> tuple[float, float]:
+    """Median norm of the accelerometer's readings, m/s^2, in the seconds in which they scatter least, and
+    that norm's deviation over it."""
+    if imu.accelerometer is None or len(imu.time_ns) < 2:
+        return np.nan, np.nan
+    span = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
+    width = int(np.clip(len(imu.time_ns) / max(span, 1e-9), 2, len(imu.time_ns)))
+    count = len(imu.time_ns) // width
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _WINDOWS)).astype(int))
+    windows = imu.accelerometer[: count * width].reshape(count, width, 3)[chosen]
+    scatter = windows.std(axis=1).sum(axis=1)
+    quiet = windows[np.argsort(scatter)[:_QUIETEST]]
+    norm = np.linalg.norm(quiet, axis=2)
+    middle = float(np.median(norm))
+    return middle, float(norm.std()) / max(middle, 1e-12)
+
+
+def marker_ratio(markers: Markers) -> float:
+    """Median ratio of the distances between markers seen together to those of the geometry."""
+    rows = np.arange(0, len(markers.time_ns), max(1, -(-len(markers.time_ns) // _FRAMES)))
+    usable, position = markers.usable[rows], markers.position[rows]
+    ratios = []
+    for i in range(len(markers.names)):
+        for j in range(i):
+            length = float(np.linalg.norm(markers.p_body_marker[i] - markers.p_body_marker[j]))
+            both = usable[:, i] & usable[:, j]
+            if length > 0.0 and both.any():
+                apart = np.linalg.norm(position[both, i] - position[both, j], axis=1)
+                ratios.append(apart / length)
+    return float(np.median(np.concatenate(ratios))) if ratios else np.nan
+
+
+def _lengths(tracker: Optical, imu: Imu, made: Turns, stated: Fit) -> dict[str, float]:
+    found = motion_agreement.distance(tracker, imu, made.lag_s, stated.frame)
+    if found is None or tracker.position is None:
+        return {}
+    far = np.linalg.norm(tracker.position[tracker.valid], axis=1)
+    return {
+        "length_ratio": found.ratio if found.correlation > ALIKE else np.nan,
+        "length_correlation": found.correlation,
+        "acceleration": found.acceleration,
+        "farthest": float(np.nanquantile(far, 0.95)),
+    }

@@ -1,0 +1,11 @@
+"""From a recording to an estimate: timeline, padding, batches of runs, causal and live estimates, results.
+
+`batch` estimates whole runs, `causal` says what was known at each time, `live` takes samples as they come.
+What is written to a result folder is in `result`.
+"""
+
+from jaxekf._support.lazy import attributes
+
+# Functions that were here while this room was one module.
+_BATCH = ("estimate", "estimate_many", "provenance", "read", "require_float64", "sharing_devices")
+__getattr__, __dir__ = attributes(__name__, {"jaxekf.estimation.batch": _BATCH})

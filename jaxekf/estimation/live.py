@@ -1,0 +1,234 @@
+"""A run estimated while it is recorded: late measurements update the past, the input carries it on."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxekf._support.compilation import jit
+from jaxekf._support.errors import FilterError, ModelError
+from jaxekf.estimation import padding
+from jaxekf.estimation.batch import evaluate_outputs, require_float64
+from jaxekf.estimation.parameters import as_arrays
+from jaxekf.estimation.timeline import knots_from
+from jaxekf.filtering import ekf
+from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
+from jaxekf.filtering.steps import Rows, Steps
+from jaxekf.geometry import manifold
+from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S
+from jaxekf.recordings.types import NANOSECONDS, Floats
+
+_INPUT_KEPT_NS = NANOSECONDS
+"""The input before the horizon that a clock offset may reach back to."""
+
+
+class Known(NamedTuple):
+    """What is known at an instant."""
+
+    time_ns: int
+    belief: Belief
+    outputs: dict[str, tuple[Any, Any]]
+    """Value and covariance of each of the model's outputs."""
+
+
+class _Sample(NamedTuple):
+    value: Any
+    mask: Any
+    aux: Any
+
+
+class Stream:
+    """Feed it what arrives, in whatever order, and ask what is known.
+
+    Beliefs older than `horizon_s` before the latest input are final: a sample taken before them is too
+    late, is not used, and is counted in `dropped`. Everything within the horizon is filtered again at each
+    question, so that the answer is that of `jaxekf.run_filter` on all that has arrived; at most `capacity`
+    instants are kept open. The first question compiles.
+
+    `belief` is that of the instant `start_ns`; samples taken at that instant are used.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        params: Parameters,
+        belief: Belief,
+        start_ns: int,
+        *,
+        horizon_s: float = 0.2,
+        capacity: int = 256,
+    ) -> None:
+        require_float64()
+        if model.input is None:
+            raise ModelError(
+                f"model '{model.name}': got no input, expected one to carry beliefs on by; name a model"
+                " with an input, such as tight"
+            )
+        self.model, self.params = model, as_arrays(params)
+        self.dropped: dict[str, int] = {sensor.name: 0 for sensor in model.sensors}
+        self._horizon_ns, self._capacity = round(horizon_s * NANOSECONDS), capacity
+        self._belief = jax.tree.map(jnp.asarray, belief)
+        self._refused = jnp.zeros(())
+        self._base_ns, self._base_is_open = int(start_ns), True
+        self._start_ns = int(start_ns)
+        self._times: list[int] = []
+        self._values: list[Floats] = []
+        self._samples: dict[int, dict[str, _Sample]] = {}
+
+    def put_input(self, time_ns: int, value: Any) -> None:
+        """A sample of the input, such as the IMU's; they come in order of time.
+
+        Raises `ModelError` for a time that does not increase, and after a gap too long to bridge.
+        """
+        if self._times and time_ns <= self._times[-1]:
+            raise ModelError(
+                f"got an input at {time_ns} ns after one at {self._times[-1]} ns, expected times that"
+                " increase; leave out repeated samples"
+            )
+        before = self._times[-1] if self._times else self._start_ns
+        usual = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0
+        if time_ns - before > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * usual):
+            raise ModelError(
+                f"got an input {(time_ns - before) / NANOSECONDS:.3f} s after the last, expected no"
+                f" gap over {LONGEST_INPUT_GAP_S} s, for nothing is made up there; start a new stream"
+                " from a belief after the gap"
+            )
+        sample = np.asarray(value, float)
+        if self._values and sample.shape != self._values[0].shape:
+            raise ModelError(
+                f"got an input of shape {sample.shape}, expected {self._values[0].shape} as before; put"
+                " every sample in whole"
+            )
+        self._times.append(int(time_ns))
+        self._values.append(sample)
+
+    def put(
+        self, sensor: str, taken_ns: int, value: Any, *, mask: Any = True, aux: Any = None
+    ) -> bool:
+        """A sample of a sensor, with the time it was *taken*; whether it is in time to be used."""
+        found = self.model.sensor(sensor)
+        late = taken_ns < self._base_ns or (taken_ns == self._base_ns and not self._base_is_open)
+        if late:
+            self.dropped[sensor] += 1
+            return False
+        _check_shapes(found, value)
+        rows = np.broadcast_to(np.asarray(mask, bool), found.rows)
+        aux = found.aux_like if aux is None else aux
+        self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
+        return True
+
+    def known(self) -> Known:
+        """What is known at the latest sample of the input."""
+        if len(self._times) < 2 or self._times[-1] < self._base_ns:
+            raise ModelError(
+                f"got {len(self._times)} samples of the input from {self._base_ns} ns on, expected two;"
+                " ask later"
+            )
+        now = self._times[-1]
+        while True:
+            instants = self._open_instants(now)
+            if len(instants) <= self._capacity:
+                break
+            final = min(len(instants) - self._capacity, self._capacity)
+            self._filter(instants[: self._capacity], final)
+        final = sum(1 for t in instants if t < now - self._horizon_ns)
+        belief, outputs = self._filter(instants, final)
+        return Known(now, belief, outputs)
+
+    def _open_instants(self, now: int) -> list[int]:
+        """Instants that are not final: of the input, and of samples up to `now`."""
+        first = self._base_ns if self._base_is_open else self._base_ns + 1
+        times = {t for t in self._times if first <= t <= now}
+        return sorted(times | {t for t in self._samples if t <= now})
+
+    def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
+        """Filter over these instants; the first `final` of them become final."""
+        steps = self._steps(instants)
+        output, outputs = _advance(self.model, self.params, self._belief, self._refused, steps)
+        count = len(instants)
+        if not np.asarray(output.instants.healthy)[:count].all():
+            raise FilterError(
+                f"got a covariance that is not finite and definite between {instants[0]} and"
+                f" {instants[-1]} ns, expected a definite one; look for wrong units in what was put in"
+            )
+        if final:
+            self._belief = jax.tree.map(lambda a: a[final - 1, 0], output.instants.updated)
+            if output.instants.refused is not None:
+                self._refused = output.instants.refused[final - 1, 0]
+            self._settle(instants[final - 1])
+        last = jax.tree.map(lambda a: a[count - 1, 0], output.instants.updated)
+        return last, jax.tree.map(lambda a: a[count - 1, 0], outputs)
+
+    def _settle(self, time_ns: int) -> None:
+        """Forget what is before an instant that has become final."""
+        self._base_ns, self._base_is_open = time_ns, False
+        self._samples = {t: s for t, s in self._samples.items() if t > time_ns}
+        kept = sum(1 for t in self._times if t < time_ns - _INPUT_KEPT_NS)
+        del self._times[:kept], self._values[:kept]
+
+    def _steps(self, instants: list[int]) -> Steps:
+        """Epochs of one substep, filled up to the capacity by inert ones."""
+        times = np.array(instants, np.int64)
+        dt = np.diff(times, prepend=self._base_ns) / NANOSECONDS
+        time = (times - self._start_ns) / NANOSECONDS
+        every = np.ones((len(times), 1), bool)
+        fast = {sensor.name: self._rows(sensor, instants) for sensor in self.model.sensors}
+        inputs = knots_from(np.array(self._times, np.int64), self._values, self._start_ns)
+        steps = Steps(time[:, None], dt[:, None], every, inputs, fast, {})
+        knots = padding.bucket(max(len(self._times), self._capacity))
+        return padding.pad(steps, self._capacity, 1, knots)
+
+    def _rows(self, sensor: Sensor, instants: list[int]) -> Rows:
+        """A sensor's samples at the instants, masked where there is none."""
+        blank = _Sample(
+            _blank(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.aux_like)
+        )
+        found = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
+        value, mask, aux = (
+            jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a])[:, None], *parts)
+            for parts in zip(*found, strict=True)
+        )
+        return Rows(value, aux, mask, np.full((len(instants), 1), self._period(sensor.name)))
+
+    def _period(self, sensor: str) -> float:
+        """Seconds between the sensor's open samples; only a gate's patience counts them."""
+        times = sorted(t for t, s in self._samples.items() if sensor in s)
+        return float(np.median(np.diff(times))) / NANOSECONDS if len(times) > 1 else 0.0
+
+
+def _check_shapes(sensor: Sensor, value: Any) -> None:
+    """Raise `ModelError` for a sample that is not of the sensor's space."""
+    expected = [np.shape(leaf) for leaf in jax.tree.leaves(_blank(sensor.space))]
+    got = [np.shape(leaf) for leaf in jax.tree.leaves(value)]
+    if got != expected:
+        raise ModelError(
+            f"sensor '{sensor.name}': got a sample of shapes {got}, expected {expected}; give it as the"
+            " sensor's space has it"
+        )
+
+
+def _blank(space: Any) -> Any:
+    return jax.tree.map(
+        lambda part: np.zeros(part.shape),
+        space,
+        is_leaf=lambda node: isinstance(node, manifold.Manifold),
+    )
+
+
+def _as_floats(tree: Any) -> Any:
+    return jax.tree.map(lambda a: np.asarray(a, float), tree)
+
+
+@partial(jit, static_argnums=0)
+def _advance(
+    model: Model, params: Parameters, belief: Belief, refused: Any, steps: Steps
+) -> tuple[ekf.FilterOutput, Mapping[str, Any]]:
+    """One window filtered, and the outputs at its instants."""
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
+    gated = any(sensor.gate is not None for sensor in model.sensors)
+    output = ekf.run_filter_batch(model, *one[:3], refused=one[3] if gated else None)
+    outputs = evaluate_outputs(model, one[0], output)
+    return jax.tree.map(lambda a: a[0], (output, outputs))

@@ -1,0 +1,264 @@
+"""Noise, calibration and initial belief as TOML files with units and where they came from."""
+
+import tomllib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tomli_w
+
+from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.filtering.model import Model, Parameters
+from jaxekf.io.atomic import write_whole
+from jaxekf.io.run_folder import SCHEMA_VERSION
+
+_SECTIONS = ("noise", "calibration", "initial")
+
+
+def as_arrays(params: Parameters) -> Parameters:
+    """The same tree with float arrays at its leaves."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+
+
+def for_runs(params: Parameters, setup: Any, runs: int) -> Parameters:
+    """The same parameters for each of several runs, on a new first axis, each with its own setup."""
+    shared = params._replace(setup=())
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), shared)
+    return every._replace(setup=setup)
+
+
+def leaf_names(section: Any) -> list[str]:
+    """Dotted name of each leaf of a pytree of parameters, in the order of its leaves."""
+    paths = jax.tree_util.tree_flatten_with_path(section)[0]
+    return [
+        ".".join(str(getattr(k, "name", getattr(k, "key", k))) for k in path) for path, _ in paths
+    ]
+
+
+def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> dict[str, Any]:
+    """A TOML document: each leaf with its value and unit."""
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "model": model.name,
+        "origin": dict(origin),
+    }
+    for section in _SECTIONS:
+        values, units = getattr(params, section), getattr(model.units, section)
+        entries = {}
+        for name, value, unit in zip(
+            leaf_names(values), jax.tree.leaves(values), jax.tree.leaves(units), strict=True
+        ):
+            entries[name] = {"value": np.asarray(value, float).tolist(), "unit": unit}
+            if unit.startswith("rad"):
+                degrees = np.rad2deg(np.asarray(value, float))
+                entries[name]["value_deg"] = np.round(degrees, 9).tolist()
+        document[section] = entries
+    return document
+
+
+def described_arrays(model: Model, params: Parameters) -> dict[str, tuple[Any, str]]:
+    """Each parameter as an array with its unit, by ``section/name``.
+
+    The setup, which a recording tells, has no units in a model: it is in SI units.
+    """
+    found = {}
+    for section in (*_SECTIONS, "setup"):
+        values, units = getattr(params, section), getattr(model.units, section)
+        names, leaves = leaf_names(values), jax.tree.leaves(values)
+        said = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
+        for name, leaf, unit in zip(names, leaves, said, strict=True):
+            found[f"{section}/{name}"] = (np.asarray(leaf), unit)
+    return found
+
+
+def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]) -> None:
+    """Write `noise.toml` (noise and initial belief) and `calibration.toml` into a folder, each whole.
+
+    Raises `ModelError` for deviations that are not positive and finite.
+
+    ``value_deg`` beside a value in radians is for reading only.
+    """
+    save_noise(path, model, params, origin)
+    if leaf_names(params.calibration):
+        save_calibration(path, model, params, origin)
+    else:
+        # What an earlier model left there must not be read beside this one's noise.
+        (Path(path) / "calibration.toml").unlink(missing_ok=True)
+
+
+def save_noise(
+    path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]
+) -> None:
+    """Write `noise.toml` alone; see `save`."""
+    check(params)
+    _write(Path(path) / "noise.toml", model, params, origin, ("noise", "initial"))
+
+
+def save_calibration(
+    path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]
+) -> None:
+    """Write `calibration.toml` alone; see `save`."""
+    _write(Path(path) / "calibration.toml", model, params, origin, ("calibration",))
+
+
+def forget(folder: Path, keep: Collection[str]) -> None:
+    """Remove the parameter files of an earlier result from the folders in `folder`, except those of some
+    names; anything else there stays."""
+    for old in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if old.name in keep or not old.is_dir():
+            continue
+        for name in ("noise.toml", "calibration.toml"):
+            (old / name).unlink(missing_ok=True)
+        if not any(old.iterdir()):
+            old.rmdir()
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _write(
+    file: Path,
+    model: Model,
+    params: Parameters,
+    origin: Mapping[str, Any],
+    sections: tuple[str, ...],
+) -> None:
+    document = to_document(model, params, origin)
+    kept = ("schema_version", "model", "origin", *sections)
+    write_whole(file, tomli_w.dumps({key: document[key] for key in kept}))
+
+
+def load(model: Model, *paths: Path | str) -> Parameters:
+    """The model's defaults with what the given files say instead.
+
+    A folder stands for the `noise.toml` and `calibration.toml` in it.
+    """
+    params = model.parameters
+    for path in map(Path, paths):
+        files = [path]
+        if path.is_dir():
+            files = [f for f in (path / "noise.toml", path / "calibration.toml") if f.is_file()]
+            if not files:
+                raise RecordingError(path, "a folder without noise.toml", "one", "another folder")
+        documents = {file: _document(file) for file in files}
+        _check_together(path, list(documents.values()))
+        for file, document in documents.items():
+            params = _filled(file, document, model, params)
+    return as_arrays(params)
+
+
+def _check_together(folder: Path, documents: list[dict[str, Any]]) -> None:
+    """Files of one folder that tell of which tuning they are must be of one."""
+    origins = [document.get("origin") for document in documents]
+    tunings = {o["tuning"] for o in origins if isinstance(o, dict) and "tuning" in o}
+    if len(tunings) > 1:
+        raise RecordingError(
+            folder,
+            f"noise.toml and calibration.toml of the tunings {' and '.join(sorted(map(str, tunings)))}",
+            "both of one, which a kill while they were written may have prevented",
+            "tuning again, or naming both files if this is meant",
+        )
+
+
+def _document(path: Path) -> dict[str, Any]:
+    """A file of parameters of a version that is known."""
+    try:
+        document = tomllib.loads(path.read_text("utf-8-sig"))
+    except FileNotFoundError:
+        raise RecordingError(path, "no such file", "a noise.toml", "another path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(
+            path, f"text that is not TOML ({error})", "TOML", "mending it"
+        ) from error
+    if document.get("schema_version") != SCHEMA_VERSION:
+        raise RecordingError(
+            path,
+            f"schema_version {document.get('schema_version')!r}",
+            str(SCHEMA_VERSION),
+            "tuning again with this version",
+        )
+    return document
+
+
+def _filled(path: Path, document: dict[str, Any], model: Model, params: Parameters) -> Parameters:
+    """The parameters with what a document says instead."""
+    if document.get("model") != model.name:
+        raise ModelError(
+            f"{path}: got parameters of the model '{document.get('model')}', expected those of"
+            f" '{model.name}'; choose that model or tune this one"
+        )
+    unknown = set(document) - {"schema_version", "model", "origin", *_SECTIONS}
+    if unknown:
+        raise RecordingError(
+            path,
+            f"sections {sorted(unknown)}",
+            f"some of {list(_SECTIONS)}",
+            "correcting the names",
+        )
+    for section in _SECTIONS:
+        if section in document:
+            units = getattr(model.units, section)
+            values = _fill(path, section, getattr(params, section), units, document[section])
+            params = params._replace(**{section: values})
+    check(params, str(path))
+    return params
+
+
+def check(params: Parameters, place: str = "parameters") -> None:
+    """Raise `ModelError` for a noise or initial deviation that is not positive and finite."""
+    for section in ("noise", "initial"):
+        tree = getattr(params, section)
+        for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True):
+            value = np.asarray(leaf, float)
+            deviations = np.diagonal(value) if value.ndim == 2 else value
+            if not (np.all(np.isfinite(value)) and np.all(deviations > 0.0)):
+                raise ModelError(
+                    f"{place}: got {section}.{name} = {value.tolist()}, expected positive standard"
+                    " deviations; try a small positive number for what is nearly exact"
+                )
+
+
+def _fill(path: Path, section: str, default: Any, units: Any, entries: Any) -> Any:
+    names = leaf_names(default)
+    if not isinstance(entries, dict):
+        raise RecordingError(path, f"{section} = {entries!r}", "a section", f"[{section}.NAME]")
+    unknown = set(entries) - set(names)
+    if unknown:
+        raise RecordingError(
+            path, f"{section} entries {sorted(unknown)}", f"some of {names}", "correcting the names"
+        )
+    leaves, structure = jax.tree.flatten(default)
+    filled = []
+    for name, unit, leaf in zip(names, jax.tree.leaves(units), leaves, strict=True):
+        if name in entries:
+            leaf = _value(path, f"{section}.{name}", entries[name], unit, np.shape(leaf))
+        filled.append(leaf)
+    return jax.tree.unflatten(structure, filled)
+
+
+def _value(path: Path, name: str, entry: Any, unit: str, shape: tuple[int, ...]) -> Any:
+    """One leaf: noise may be given for all axes, each or as a factor; calibration keeps its shape."""
+    if not isinstance(entry, dict) or "value" not in entry:
+        raise RecordingError(
+            path,
+            f"{name} = {entry!r}",
+            "an entry with value and unit",
+            f'value = ..., unit = "{unit}"',
+        )
+    if entry.get("unit", unit) != unit:
+        raise RecordingError(path, f"{name} in {entry['unit']}", unit, "converting the value")
+    try:
+        value = np.asarray(entry["value"], float)
+    except (TypeError, ValueError):
+        value = np.full(1, np.nan)
+    known = {shape} if name.startswith("calibration") else {(), (3,), (4,), (3, 3), (4, 4), shape}
+    if value.shape not in known or not np.all(np.isfinite(value)):
+        raise RecordingError(
+            path,
+            f"{name} = {entry['value']!r}",
+            f"finite numbers of a shape in {sorted(known, key=str)}",
+            "correcting the value",
+        )
+    return value

@@ -1,0 +1,366 @@
+"""Asynchronous streams merged to one sequence of steps, with exact times.
+
+The steps come in *epochs* of a fixed number of substeps. A fast sensor may be sampled at every
+substep; a slow one (a tracker beside a gyroscope) only at the last of its epoch, so that its update
+is not paid for at every fast step. Epochs that are not full are padded **in front** by substeps of
+``dt = 0``, which change nothing. A sample that is missing is a mask, never a held value.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation.output_times import Requested, within
+from jaxekf.filtering.model import Model, Sensor, Start
+from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S, longest_ns
+from jaxekf.recordings.sample_selection import (
+    count,
+    cut,
+    first_visible,
+    hold,
+    of_rows,
+    take,
+    visible,
+)
+from jaxekf.recordings.types import NANOSECONDS, Recording, Samples, Times, period_ns
+
+_UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
+_LONGEST_EPOCH = 32
+_EXTRAPOLATED_S = 0.5
+"""A time without any sample from which on a user is told."""
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The steps of one run, and what the host must remember about them."""
+
+    name: str
+    steps: Steps
+    time_ns: Times
+    """(K, S) int64 nanoseconds at the end of each substep."""
+    first: dict[str, Any]
+    """First visible sample of each sensor."""
+    account: dict[str, dict[str, int]] = field(default_factory=dict)
+    """For each stream: rows read, fed to the filter, masked, and dropped by reason."""
+    notes: tuple[str, ...] = ()
+    """What a user should know of how the run was read."""
+    setup: Any = ()
+    """`Parameters.setup` of this run."""
+    latency_ns: dict[str, int] = field(default_factory=dict)
+    """How late each sensor's samples were known."""
+    requested_ns: Times | None = None
+    """Instants that were asked for, each of them one of `time_ns`."""
+    measured_ns: Times | None = None
+    """Where some were asked for, the instants that there would be without."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(K, S) substeps that are not padding."""
+        return np.asarray(self.steps.valid)
+
+
+def build(
+    model: Model,
+    recording: Recording,
+    slow: tuple[str, ...] | None = None,
+    at: Requested | None = None,
+) -> Timeline:
+    """The timeline of one recording for one model.
+
+    `slow` names the sensors that are sampled at the end of epochs only; None finds them. `at` adds
+    instants at which nothing is measured; of times, those outside the run are left out, with a note.
+
+    Raises `RecordingError` where streams are missing or do not overlap, where a sensor that the
+    model must start with is never seen, or where all of `at` lies outside the run; `ModelError` for `at`
+    of a model whose steps are those of one stream (`Model.hold_to`).
+    """
+    samples = {s.name: _read(s, recording) for s in model.sensors}
+    driver, counted = None, dict(samples)
+    if model.input is not None:
+        counted[model.input.name] = model.input.source(recording)
+        driver = _check_input(counted[model.input.name], recording, model.input.name)
+    start, end, found = _span(model, recording, samples, driver)
+    account = {
+        name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
+        for name, stream in counted.items()
+    }
+    samples = {name: cut(stream, start, end) for name, stream in samples.items()}
+    for name, stream in samples.items():
+        if len(stream.time_ns) == 0:
+            raise RecordingError(
+                recording.path or recording.name,
+                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, where"
+                f" the run of model '{model.name}' lies",
+                "at least one",
+                "streams that overlap, or a model without that sensor",
+            )
+    if model.hold_to is not None:
+        samples = hold(samples, model.hold_to, account)
+    events = [stream.time_ns for stream in samples.values()]
+    if driver is not None:
+        inside = (driver.time_ns >= start) & (driver.time_ns <= end)
+        events.append(driver.time_ns[inside])
+    notes = (found.note,) if found is not None and found.note else ()
+    if part := recording.info.get("part"):
+        notes = (f"part {part}", *notes)
+    if driver is None and model.hold_to is None:
+        notes += _long_silence(samples, start)
+    asked = measured = None
+    if at is not None and model.hold_to is not None:
+        raise ModelError(
+            f"model '{model.name}' got times to estimate at, expected none because its steps are the"
+            f" samples of {model.hold_to}, and others would change it; take a model that holds nothing"
+        )
+    if at is not None:
+        asked, note = within(at, start, end, recording.path or recording.name)
+        measured = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
+        events.append(asked)
+        notes += (note,) if note else ()
+    times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
+    if slow is None:
+        slow = _slow_sensors(samples, times)
+    index = _epochs(times, [samples[name].time_ns for name in slow])
+    steps, step_times = _lay_out(times, index, samples, slow, start)
+    if driver is not None:
+        steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
+    if found is None:
+        found = Start(start, {name: first_visible(stream) for name, stream in samples.items()})
+    latency = {name: stream.latency_ns for name, stream in samples.items()}
+    setup = model.parameters.setup if model.setup is None else model.setup(recording)
+    return Timeline(
+        recording.name,
+        steps,
+        step_times,
+        found.first,
+        account,
+        notes,
+        setup,
+        latency,
+        asked,
+        measured,
+    )
+
+
+def build_many(
+    model: Model, recordings: Sequence[Recording], at: Sequence[Requested | None] | None = None
+) -> list[Timeline]:
+    """Timelines of several recordings, laid out alike so that they can be stacked; `at` for each."""
+    timelines: list[Timeline] = []
+    at = [None] * len(recordings) if at is None else at
+    for recording, asked in zip(recordings, at, strict=True):
+        slow = tuple(timelines[0].steps.slow) if timelines else None
+        timelines.append(build(model, recording, slow, asked))
+    return timelines
+
+
+def from_steps(name: str, steps: Steps, first: dict[str, Any], start_ns: int = 0) -> Timeline:
+    """A timeline from arrays that never were a recording, such as simulated ones."""
+    time_ns = start_ns + np.round(np.asarray(steps.time) * NANOSECONDS).astype(np.int64)
+    return Timeline(name, steps, time_ns, first)
+
+
+def _read(sensor: Sensor, recording: Recording) -> Samples:
+    if sensor.source is None:
+        raise ModelError(
+            f"sensor '{sensor.name}' got a recording, expected arrays because it names no source;"
+            " give it a source"
+        )
+    samples = sensor.source(recording)
+    mask = np.asarray(samples.mask)
+    if mask.ndim == 1:
+        mask = np.repeat(mask[:, None], sensor.rows, axis=1)
+    aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)
+    return replace(samples, mask=mask, aux=aux)
+
+
+def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
+    """Auxiliary data, what is not finite in hidden samples replaced by a known value.
+
+    It passes through the model's own functions, whose gradient a NaN would reach even where the row
+    is masked.
+    """
+    values = np.array(values)
+    known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    shown = mask.any(axis=1)
+    bad = np.flatnonzero(shown & ~known)
+    if bad.size:
+        raise RecordingError(
+            recording.path or recording.name,
+            f"auxiliary data of {name} that is not finite at sample {int(bad[0])}",
+            "finite data for every visible sample",
+            "masking the sample",
+        )
+    values[~known] = values[np.argmax(known)] if known.any() else 1.0
+    return values
+
+
+def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
+    """The input's valid samples; an input cannot be masked, so that a long gap in it is an error."""
+    driver = take(driver, np.asarray(driver.mask))
+    place = recording.path or recording.name
+    count = len(driver.time_ns)
+    if count < 2:
+        raise RecordingError(
+            place, f"{count} samples of {name}", "at least two", "a longer recording"
+        )
+    steps = np.diff(driver.time_ns)
+    longest = int(np.argmax(steps))
+    if steps[longest] > longest_ns(driver.time_ns):
+        begin = driver.time_ns[longest] / NANOSECONDS
+        raise RecordingError(
+            place,
+            f"a gap of {steps[longest] / NANOSECONDS:.3f} s in {name} at {begin:.6f} s",
+            f"none longer than {LONGEST_INPUT_GAP_S} s",
+            "cutting the run there (jaxekf.split_at_gaps), or a model that measures it (loose_rate)",
+        )
+    return driver
+
+
+def _long_silence(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
+    """A sentence where for long no sensor saw anything."""
+    seen = [stream.time_ns[visible(stream)] for stream in samples.values()]
+    times = np.unique(np.concatenate(seen))
+    steps = np.diff(times) / NANOSECONDS
+    long = np.flatnonzero(steps > _EXTRAPOLATED_S)
+    if not long.size:
+        return ()
+    at = ", ".join(f"{(times[i] - start) / NANOSECONDS:.3f}" for i in long[:5])
+    return (
+        f"from {at} s{' and later' if long.size > 5 else ''} on no sensor saw anything for up to"
+        f" {steps[long].max():.3f} s: there the estimate is extrapolated",
+    )
+
+
+def _describe(times: Times) -> str:
+    return f"{times[0] / NANOSECONDS:.6f} to {times[-1] / NANOSECONDS:.6f} s"
+
+
+def _span(
+    model: Model, recording: Recording, samples: dict[str, Samples], driver: Samples | None
+) -> tuple[int, int, Start | None]:
+    """First and last time of the run: from the first usable samples to where the input ends."""
+    place = recording.path or recording.name
+    start = min(int(s.time_ns[0]) for s in samples.values())
+    end = max(int(s.time_ns[-1]) for s in samples.values())
+    if driver is not None:
+        for name, stream in samples.items():
+            if stream.time_ns[0] > driver.time_ns[-1] or stream.time_ns[-1] < driver.time_ns[0]:
+                raise RecordingError(
+                    place,
+                    f"{name} over {_describe(stream.time_ns)} and the input"
+                    f" over {_describe(driver.time_ns)}",
+                    "streams that overlap in time",
+                    "checking the clocks and units of both",
+                )
+        start, end = int(driver.time_ns[0]), int(driver.time_ns[-1])
+    elif model.hold_to is None and len(samples) > 1:
+        _check_overlap(place, samples)
+    for name in model.start_with:
+        stream = samples[name]
+        seen = stream.time_ns[visible(stream) & (stream.time_ns >= start)]
+        if seen.size == 0 or seen[0] > end:
+            raise RecordingError(
+                place,
+                f"no visible sample of {name} within the run",
+                "at least one to start from",
+                "a run in which the tool is seen",
+            )
+        start = max(start, int(seen[0]))
+    if model.find_start is None:
+        return start, end, None
+    inside = {name: cut(stream, start, end) for name, stream in samples.items()}
+    found = model.find_start(recording, inside)
+    if found is None:
+        raise RecordingError(
+            place,
+            f"no instant at which '{model.name}' can start",
+            "at least one (see the model)",
+            "a run in which enough is seen at once: markers of the tool, or landmarks in an image",
+        )
+    return found.time_ns, end, found
+
+
+def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
+    names = list(samples)
+    for other in names[1:]:
+        a, b = samples[names[0]].time_ns, samples[other].time_ns
+        if a[0] > b[-1] or a[-1] < b[0]:
+            raise RecordingError(
+                place,
+                f"{names[0]} over {_describe(a)} and {other} over {_describe(b)}",
+                "streams that overlap in time",
+                "checking the clocks and units of both",
+            )
+
+
+def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:
+    """Sensors sampled at no more than half of the instants."""
+    return tuple(name for name, s in samples.items() if 2 * len(s.time_ns) <= len(times) + 1)
+
+
+def _epochs(times: Times, slow_times: list[Times]) -> NDArray[np.intp]:
+    """Index of the instant of each substep, (K, S), -1 in padding; slow samples fall on the last."""
+    if not slow_times:
+        return np.arange(len(times))[:, None]
+    ends = np.flatnonzero(np.isin(times, np.concatenate(slow_times)))
+    if ends.size == 0 or ends[-1] != len(times) - 1:
+        ends = np.append(ends, len(times) - 1)
+    lengths = np.diff(ends, prepend=-1)
+    sizes = np.arange(1, min(_LONGEST_EPOCH, int(lengths.max())) + 1)
+    epochs = np.array([np.ceil(lengths / size).sum() for size in sizes])
+    size = int(sizes[np.argmin(epochs * (sizes + _UPDATE_COST))])
+    chunks = np.ceil(lengths / size).astype(int)
+    index = np.full((int(chunks.sum()), size), -1)
+    last_row = np.cumsum(chunks) - 1
+    for end, length, row in zip(ends, lengths, last_row, strict=True):
+        instants = np.arange(end - length + 1, end + 1)
+        offset = (row + 1) * size - length
+        index.reshape(-1)[offset : offset + length] = instants
+    return index
+
+
+def _lay_out(
+    times: Times,
+    index: NDArray[np.intp],
+    samples: dict[str, Samples],
+    slow: tuple[str, ...],
+    start: int,
+) -> tuple[Steps, Times]:
+    valid = index >= 0
+    # A padded substep carries the instant of the valid one before it (the start, if there is none).
+    flat = np.maximum.accumulate(index.reshape(-1)).reshape(index.shape)
+    step_times = np.where(flat >= 0, times[np.maximum(flat, 0)], start)
+    dt_ns = np.diff(step_times.reshape(-1), prepend=start).reshape(index.shape)
+    fast = {
+        n: _rows(s, np.where(valid, step_times, -1)) for n, s in samples.items() if n not in slow
+    }
+    ends = {n: _rows(samples[n], np.where(valid, step_times, -1)[:, -1]) for n in slow}
+    steps = Steps((step_times - start) / NANOSECONDS, dt_ns / NANOSECONDS, valid, None, fast, ends)
+    return steps, step_times
+
+
+def _rows(samples: Samples, asked: Times) -> Rows:
+    """The samples at the asked times; masked where there is none."""
+    at = np.clip(np.searchsorted(samples.time_ns, asked), 0, len(samples.time_ns) - 1)
+    here = samples.time_ns[at] == asked
+    nominal = period_ns(samples.time_ns)
+    since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal)
+    # After a dropout a sample has not averaged over the gap: its own period is the nominal one.
+    since = np.minimum(since, nominal) / NANOSECONDS
+    taken = take(samples, at)
+    return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
+
+
+def knots_from(time_ns: Times, value: Any, start: int) -> Knots:
+    """The knots of an input sampled at these times, in seconds since `start`."""
+    time = (time_ns - start) / NANOSECONDS
+    value = np.asarray(value, float)
+    steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]
+    integral = np.concatenate([np.zeros_like(value[:1]), np.cumsum(steps, axis=0)])
+    return Knots(time, value, integral)

@@ -1,0 +1,154 @@
+"""How good an estimate is: error against truth, and whether its uncertainty is honest."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxekf.estimation.result import Estimated
+from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
+from jaxekf.recordings.types import Encoder, Flags, Floats, Optical, Recording, Times, to_scipy
+
+
+class Score(NamedTuple):
+    """Agreement of one estimate with its encoder on the scored samples."""
+
+    attitude_rmse_deg: float
+    rate_rmse_deg_s: float
+    attitude_nees: float
+    """Mean normalised estimation error squared by degree of freedom: 1 where honest, above 1 where
+    overconfident."""
+    position_rmse_mm: float
+    """Root mean square of the distance to the encoder's position; NaN where either has none."""
+    position_nees: float
+    """As `attitude_nees`, of the position."""
+    samples: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return self._asdict()
+
+
+def attitude_error(q: Floats, truth: Floats) -> Floats:
+    """Rotation vectors (N, 3) in radians from `q` to `truth`, in the body frame of `q`."""
+    return (to_scipy(q).inv() * to_scipy(truth)).as_rotvec()
+
+
+class OrientationError(NamedTuple):
+    """Root mean squares of the angle between estimate and truth, and of its two parts, in degrees."""
+
+    total_deg: float
+    heading_deg: float
+    """Of its turn about the vertical."""
+    inclination_deg: float
+    """Of what is left: the least turn that puts the vertical right."""
+
+
+def orientation_error(
+    q: Floats, truth: Floats, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+) -> OrientationError:
+    """Errors of quaternions (N, 4), body to reference, as BROAD counts them (Laidig et al. 2021).
+
+    `up` is the vertical in the reference frame. No offset of the heading is taken off.
+    """
+    off = (to_scipy(q) * to_scipy(truth).inv()).as_quat()
+    vertical = np.asarray(up) / np.linalg.norm(up)
+    about, scalar = np.abs(off[:, :3] @ vertical), np.abs(off[:, 3])
+    total = 2.0 * np.arccos(np.clip(scalar, 0.0, 1.0))
+    heading = 2.0 * np.arctan2(about, scalar)
+    inclination = 2.0 * np.arccos(np.clip(np.hypot(about, scalar), 0.0, 1.0))
+    return OrientationError(
+        *(float(np.rad2deg(np.sqrt(np.mean(a**2)))) for a in (total, heading, inclination))
+    )
+
+
+def rms(values: Floats) -> float:
+    """Root of the mean square of the lengths of vectors (N, d); NaN rows do not count."""
+    squared = np.sum(np.asarray(values) ** 2, axis=-1)
+    squared = squared[np.isfinite(squared)]
+    return float(np.sqrt(np.mean(squared))) if squared.size else float("nan")
+
+
+def normalised_square(error: Floats, cov: Floats) -> Floats:
+    """``e' inv(P) e`` for each of (N, d), (N, d, d)."""
+    return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
+
+
+def mean_nees(error: Floats, cov: Floats) -> float:
+    """Mean of ``e' inv(P) e / d`` over (N, d), (N, d, d); NaN of none."""
+    squared = normalised_square(error, cov)
+    return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
+
+
+def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
+    """Errors (N, 3) of those outputs (attitude, rate, position, velocity) of which the encoder tells the
+    truth; NaN at instants whose nearest encoder sample is not scored or not known. SI; of an attitude the
+    rotation vector in the body frame. Raises `RecordingError` for a run without an encoder.
+    """
+    encoder, outputs = recording.need_encoder(), estimate.outputs
+    truth = encoder_at(encoder, estimate.time_ns)
+    errors: dict[str, Floats] = {}
+    if "attitude" in outputs:
+        errors["attitude"] = attitude_error(outputs["attitude"].value, truth.q_ref_body)
+    if "rate" in outputs:
+        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, estimate.time_ns)
+    if "position" in outputs and truth.position is not None:
+        errors["position"] = outputs["position"].value - truth.position
+    if "velocity" in outputs and truth.position is not None:
+        velocity = encoder_velocity_at(encoder, estimate.time_ns)
+        errors["velocity"] = outputs["velocity"].value - velocity
+    return {name: np.where(truth.scored[:, None], e, np.nan) for name, e in errors.items()}
+
+
+def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> Score:
+    """Errors of attitude, rate and position, and NEES of attitude and position, at those instants of the
+    estimate whose nearest encoder sample is scored.
+
+    What the model does not put out, or the encoder does not tell, is NaN. Positions are those of the
+    body's origin in the reference frame. Raises `RecordingError` for a run without an encoder.
+    """
+    truth = encoder_at(recording.need_encoder(), estimate.time_ns)
+    judged = truth.scored & (estimate.time >= burn_in_s)
+    attitude = rate = nees = float("nan")
+    if "attitude" in estimate.outputs:
+        output = estimate.outputs["attitude"]
+        error = attitude_error(output.value[judged], truth.q_ref_body[judged])
+        attitude = float(np.rad2deg(rms(error)))
+        nees = mean_nees(error, output.cov[judged])
+    if "rate" in estimate.outputs:
+        true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
+        rate = float(np.rad2deg(rms(estimate.outputs["rate"].value[judged] - true_rate)))
+    where, where_nees = _position_score(estimate, truth, judged)
+    return Score(attitude, rate, nees, where, where_nees, int(judged.sum()))
+
+
+def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple[float, float]:
+    """RMSE in mm and NEES of the position; a blank cell of the encoder's position does not count."""
+    if "position" not in estimate.outputs or truth.position is None:
+        return float("nan"), float("nan")
+    judged = judged & np.isfinite(truth.position).all(axis=1)
+    position = estimate.outputs["position"]
+    error = truth.position[judged] - position.value[judged]
+    return 1e3 * rms(error), mean_nees(error, position.cov[judged])
+
+
+def hold_last(optical: Optical, time_ns: Times) -> Floats:
+    """The last visible tracker attitude (N, 4) at each time: what there is without a filter."""
+    seen = np.flatnonzero(optical.valid)
+    at = np.searchsorted(optical.time_ns[seen], time_ns, side="right") - 1
+    return optical.q_ref_body[seen[np.maximum(at, 0)]]
+
+
+def score_hold_last(recording: Recording, time_ns: Times) -> float:
+    """Attitude RMSE in degrees of holding the tracker, on the encoder's scored samples."""
+    truth = encoder_at(recording.need_encoder(), time_ns)
+    held = hold_last(recording.need_optical(), time_ns)
+    error = attitude_error(held[truth.scored], truth.q_ref_body[truth.scored])
+    return float(np.rad2deg(rms(error)))
+
+
+def score_raw_rate(recording: Recording) -> float:
+    """Rate RMSE in deg/s of the gyroscope as it is, bias and noise included."""
+    imu = recording.need_imu()
+    scored = encoder_at(recording.need_encoder(), imu.time_ns).scored
+    error = imu.gyroscope - encoder_rate_at(recording.need_encoder(), imu.time_ns)
+    return float(np.rad2deg(rms(error[scored])))

@@ -1,0 +1,334 @@
+"""State spaces: what a state is made of, and how a small error moves it.
+
+A state is a NamedTuple of arrays. Its *space* is the same NamedTuple type holding manifolds instead
+of arrays, one for each field (nesting is allowed). From this one declaration come the size of the
+error vector, the place of each part in it, labels, units and column headers.
+
+Errors act on the right, in the body frame: ``local(x, retract(x, delta)) == delta`` for errors
+inside the injectivity radius, and ``retract(x, local(x, y))`` is ``y`` (for rotations up to sign).
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxekf.geometry import rotation
+
+_AXES = ("x", "y", "z")
+
+
+class Manifold(ABC):
+    """One part of a state: how it is stored, how an error vector moves it, and its names.
+
+    A manifold of your own gives the abstract members; the derivatives below have defaults by autodiff.
+    """
+
+    unit: str
+    """Unit of the error vector."""
+    frame: str = "body"
+    """Frame in which the error vector is counted."""
+
+    @property
+    @abstractmethod
+    def dim(self) -> int:
+        """Length of the error vector."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the stored array."""
+
+    @property
+    @abstractmethod
+    def component_labels(self) -> tuple[str, ...]:
+        """Suffix of each stored number, for column headers."""
+
+    @property
+    @abstractmethod
+    def error_labels(self) -> tuple[str, ...]:
+        """Suffix of each component of the error vector."""
+
+    @abstractmethod
+    def retract(self, x: Array, delta: Array) -> Array:
+        """``x`` moved by the error ``delta``."""
+
+    @abstractmethod
+    def local(self, x: Array, y: Array) -> Array:
+        """The error that moves ``x`` to ``y``."""
+
+    @property
+    def curved(self) -> bool:
+        """Whether `reset_jacobian` differs from the identity."""
+        return True
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        """Derivative of ``retract(x, .)`` at zero, applied to `delta`: an error as a change of ``x``."""
+        return jax.jvp(lambda d: self.retract(x, d), (jnp.zeros_like(delta),), (delta,))[1]
+
+    def lower(self, x: Array, change: Array) -> Array:
+        """Derivative of ``local(x, .)`` at ``x``, applied to `change`: a change of ``x`` as an error."""
+        return jax.jvp(lambda y: self.local(x, y), (x,), (change,))[1]
+
+    def reset_jacobian(self, delta: Array) -> Array:
+        """Derivative, at zero, of ``e -> local(retract(x, delta), retract(x, delta + e))``.
+
+        The default holds where it does not depend on ``x``, as for a Lie group.
+        """
+        raise TypeError(
+            f"got the curved manifold {type(self).__name__} without reset_jacobian, expected one;"
+            " define it, or set curved to False where the identity is good enough"
+        )
+
+
+@dataclass(frozen=True)
+class Euclidean(Manifold):
+    """A vector of `size` numbers; the error is added."""
+
+    size: int
+    unit: str = ""
+    labels: tuple[str, ...] = ()
+    frame: str = "body"
+
+    @property
+    def dim(self) -> int:
+        return self.size
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (self.size,)
+
+    @property
+    def component_labels(self) -> tuple[str, ...]:
+        if self.labels:
+            return self.labels
+        return _AXES if self.size == 3 else tuple(str(i) for i in range(self.size))
+
+    @property
+    def error_labels(self) -> tuple[str, ...]:
+        return self.component_labels
+
+    @property
+    def curved(self) -> bool:
+        return False
+
+    def retract(self, x: Array, delta: Array) -> Array:
+        return x + delta
+
+    def local(self, x: Array, y: Array) -> Array:
+        return y - x
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        return delta
+
+    def lower(self, x: Array, change: Array) -> Array:
+        return change
+
+
+@dataclass(frozen=True)
+class SO3(Manifold):
+    """A rotation stored as a unit quaternion w, x, y, z; the error is a body-frame rotation vector."""
+
+    unit: str = "rad"
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (4,)
+
+    @property
+    def component_labels(self) -> tuple[str, ...]:
+        return ("w", *_AXES)
+
+    @property
+    def error_labels(self) -> tuple[str, ...]:
+        return _AXES
+
+    def retract(self, x: Array, delta: Array) -> Array:
+        return rotation.keep_unit(rotation.product(x, rotation.exp(delta)))
+
+    def local(self, x: Array, y: Array) -> Array:
+        return rotation.difference(x, y)
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        return 0.5 * rotation.product(x, rotation.pure(delta))
+
+    def lower(self, x: Array, change: Array) -> Array:
+        return 2.0 * rotation.product(rotation.conjugate(x), change)[..., 1:]
+
+    def reset_jacobian(self, delta: Array) -> Array:
+        return rotation.right_jacobian(delta)
+
+
+@dataclass(frozen=True)
+class AdditiveQuaternion(Manifold):
+    """A quaternion treated as four numbers, as Cheng (2023) does; the error is added.
+
+    The two signs of a quaternion are one rotation, so `local` takes the sign of ``y`` that is nearer
+    to ``x``. Nothing keeps the norm at one: the model's `project` does.
+    """
+
+    unit: str = ""
+
+    @property
+    def dim(self) -> int:
+        return 4
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (4,)
+
+    @property
+    def component_labels(self) -> tuple[str, ...]:
+        return ("w", *_AXES)
+
+    @property
+    def error_labels(self) -> tuple[str, ...]:
+        return ("w", *_AXES)
+
+    @property
+    def curved(self) -> bool:
+        return False
+
+    def retract(self, x: Array, delta: Array) -> Array:
+        return x + delta
+
+    def local(self, x: Array, y: Array) -> Array:
+        return jnp.where(jnp.sum(x * y) < 0.0, -y, y) - x
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        return delta
+
+    def lower(self, x: Array, change: Array) -> Array:
+        return change
+
+
+class Part(NamedTuple):
+    """Where one leaf of a space stands: its name, its manifold and its place in the error vector."""
+
+    name: str
+    manifold: Manifold
+    error: slice
+
+
+def _is_manifold(node: Any) -> bool:
+    return isinstance(node, Manifold)
+
+
+def _flatten(space: Any, *states: Any) -> tuple[list[Manifold], list[list[Array]], Any]:
+    manifolds, structure = jax.tree.flatten(space, is_leaf=_is_manifold)
+    return manifolds, [structure.flatten_up_to(state) for state in states], structure
+
+
+def parts(space: Any) -> tuple[Part, ...]:
+    """The leaves of a space in order, with their names and their places in the error vector."""
+    found, start = [], 0
+    for path, manifold in jax.tree_util.tree_flatten_with_path(space, is_leaf=_is_manifold)[0]:
+        name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
+        found.append(Part(name, manifold, slice(start, start + manifold.dim)))
+        start += manifold.dim
+    return tuple(found)
+
+
+def error_dim(space: Any) -> int:
+    """Length of the error vector of a space."""
+    return sum(part.manifold.dim for part in parts(space))
+
+
+def error_labels(space: Any) -> tuple[str, ...]:
+    """Name of each component of the error vector, ``bias_x`` for instance."""
+    return tuple(
+        "_".join(filter(None, (part.name, label)))
+        for part in parts(space)
+        for label in part.manifold.error_labels
+    )
+
+
+def component_labels(space: Any) -> tuple[str, ...]:
+    """Name of each stored number, ``q_ref_body_w`` for instance."""
+    return tuple(
+        "_".join(filter(None, (part.name, label)))
+        for part in parts(space)
+        for label in part.manifold.component_labels
+    )
+
+
+def error_units(space: Any) -> tuple[str, ...]:
+    """Unit of each component of the error vector."""
+    return tuple(part.manifold.unit for part in parts(space) for _ in range(part.manifold.dim))
+
+
+def retract(space: Any, x: Any, delta: Array) -> Any:
+    """``x`` moved by the error vector ``delta``, shape (error_dim,)."""
+    manifolds, (leaves,), structure = _flatten(space, x)
+    moved, start = [], 0
+    for manifold, leaf in zip(manifolds, leaves, strict=True):
+        moved.append(manifold.retract(leaf, delta[start : start + manifold.dim]))
+        start += manifold.dim
+    return jax.tree.unflatten(structure, moved)
+
+
+def local(space: Any, x: Any, y: Any) -> Array:
+    """The error vector that moves ``x`` to ``y``, shape (error_dim,)."""
+    manifolds, (first, second), _ = _flatten(space, x, y)
+    return jnp.concatenate(
+        [m.local(a, b) for m, a, b in zip(manifolds, first, second, strict=True)]
+    )
+
+
+def lift(space: Any, x: Any, delta: Array) -> Any:
+    """An error vector as a change of the stored numbers of ``x`` (linear in `delta`)."""
+    manifolds, (leaves,), structure = _flatten(space, x)
+    changes, start = [], 0
+    for manifold, leaf in zip(manifolds, leaves, strict=True):
+        changes.append(manifold.lift(leaf, delta[start : start + manifold.dim]))
+        start += manifold.dim
+    return jax.tree.unflatten(structure, changes)
+
+
+def lower(space: Any, x: Any, change: Any) -> Array:
+    """A change of the stored numbers of ``x`` as an error vector (linear in `change`)."""
+    manifolds, (leaves, changes), _ = _flatten(space, x, change)
+    return jnp.concatenate(
+        [m.lower(a, b) for m, a, b in zip(manifolds, leaves, changes, strict=True)]
+    )
+
+
+def is_curved(space: Any) -> bool:
+    """Whether moving the mean changes the covariance, because a part of the space is curved."""
+    return any(part.manifold.curved for part in parts(space))
+
+
+def reset_jacobian(space: Any, delta: Array) -> Array:
+    """Derivative (n, n) of the error counted from ``retract(x, delta)`` by the one counted from ``x``.
+
+    The error vector of an updated state is counted from its new mean; to first order it is
+    ``J(delta)`` times the old one (Sola, Deray, Atchuthan 2018, eq. 67 for rotations).
+    """
+    size = error_dim(space)
+    rows = []
+    for part in parts(space):
+        dim, start = part.manifold.dim, part.error.start
+        block = jnp.eye(dim, dtype=delta.dtype)
+        if part.manifold.curved:
+            block = part.manifold.reset_jacobian(delta[part.error])
+        before, after = jnp.zeros((dim, start)), jnp.zeros((dim, size - start - dim))
+        pieces = [before.astype(delta.dtype), block, after.astype(delta.dtype)]
+        rows.append(jnp.concatenate(pieces, axis=1))
+    return jnp.concatenate(rows)
+
+
+def dtype_of(state: Any) -> Any:
+    """The floating-point type shared by the leaves of a state."""
+    return jnp.result_type(*jax.tree.leaves(state))
+
+
+def copy_where(condition: Array, yes: Any, no: Any) -> Any:
+    """``yes`` where the scalar `condition` holds, else ``no``, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,0 +1,128 @@
+"""The scaled unscented transform: mean and covariance of a function of a random vector.
+
+Instead of a derivative, the function is taken at ``2 n + 1`` points: the mean and, along each column of a
+factor of the covariance, a step of ``sqrt(n + lambda)`` either way, ``lambda = alpha^2 (n + kappa) - n``.
+Means of quadratic functions are exact, where the derivative sees only the linear part.
+
+Ang, Khosla and Riviere find the covariance of an angular velocity so (eqs. 34 to 37), from acceleration
+differences whose covariance is that of eq. 32. What is wrong in print: what eqs. 34 and 35 give is the
+plain transform, not the scaled one, with the weight of the mean ``c_0 = kappa / (n + kappa)`` (``S_0`` is
+the point at distance 0, the measured differences themselves) and all others ``1 / (2 (n + kappa))``. It is
+the case ``alpha = 1, beta = 0`` here, the default, and with ``n = 3`` the usual ``kappa = 3 - n`` is 0. In
+eq. 32 the difference of two independent readings has twice the variance of one, not four times.
+
+Covariances may be semidefinite. Derivatives with respect to mean and covariance are finite everywhere; a
+direction without variance takes no part, and a variance of 0 gets no gradient.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxekf.geometry import linalg, manifold
+
+
+class Moments(NamedTuple):
+    """What the transform finds."""
+
+    mean: Any
+    """(m,); of `transform_on` a point of the output's space."""
+    cov: Array
+    """(m, m) covariance of the output, or of its error vector at `mean`."""
+    cross: Array
+    """(n, m) covariance of the input, or of its error vector, with the output's."""
+
+
+def transform(
+    fn: Callable[[Array], Array],
+    mean: Array,
+    cov: Array,
+    *,
+    alpha: float = 1.0,
+    beta: float = 0.0,
+    kappa: float = 0.0,
+) -> Moments:
+    """Mean, covariance and cross-covariance of ``fn(x)``, x of `mean` (n,) and `cov` (n, n).
+
+    `fn` takes (n,) to (m,). `alpha` > 0 scales the distance of the points from the mean; `beta` adds
+    to the weight of the mean in the covariance, 2 being best for a Gaussian; `kappa` > -n sets the
+    distance too. The weights are
+
+        mean          lambda / (n + lambda)
+        covariance    lambda / (n + lambda) + 1 - alpha^2 + beta     of the point at the mean
+        both          1 / (2 (n + lambda))                          of every other point
+
+    With ``n + lambda = 3`` the fourth moments along the axes are those of a Gaussian. ``beta >= alpha^2``,
+    or ``kappa >= 0`` with ``alpha = 1``, keep the covariance from becoming indefinite. Small `alpha` costs
+    no digits but those of the differences of `fn` themselves. A `cov` that is not semidefinite gives NaN.
+
+    Raises ValueError when ``alpha^2 (n + kappa)`` is not positive or shapes do not fit.
+    """
+    mean, cov = jnp.asarray(mean), jnp.asarray(cov)
+    size = mean.shape[0] if mean.ndim == 1 else -1
+    if cov.shape != (size, size):
+        raise ValueError(
+            f"got a mean of shape {mean.shape} and a covariance of shape {cov.shape}, expected (n,)"
+            " and (n, n); for many of them use jax.vmap"
+        )
+    squared_distance = alpha**2 * (size + kappa)
+    if not squared_distance > 0.0:
+        raise ValueError(
+            f"got alpha = {alpha} and kappa = {kappa} for {size} numbers, expected"
+            " alpha^2 (n + kappa) > 0; try alpha = 1 and kappa = 0"
+        )
+    distance = squared_distance**0.5
+    factor = linalg.semidefinite_factor(cov)
+    centre = fn(mean)
+    steps = distance * factor.T
+    ahead = jax.vmap(lambda step: fn(mean + step))(steps) - centre[None]
+    behind = jax.vmap(lambda step: fn(mean - step))(steps) - centre[None]
+    # Sums over pairs of points, counted from the value at the mean: the large weights of opposite sign
+    # that a small alpha brings never meet. With s the mean's shift from the centre, the usual sum over
+    # deviations from the mean is that of squares about the centre plus (beta - alpha^2) s s'.
+    odd, even = (ahead - behind) / (2.0 * distance), (ahead + behind) / (2.0 * distance)
+    shift = jnp.sum(even, axis=0) / distance
+    spread = linalg.multiply(odd.T, odd) + linalg.multiply(even.T, even)
+    about_mean = (beta - alpha**2) * shift[:, None] * shift[None, :]
+    return Moments(
+        centre + shift, linalg.symmetrise(spread + about_mean), linalg.multiply(factor, odd)
+    )
+
+
+def transform_on(
+    fn: Callable[[Any], Any],
+    mean: Any,
+    cov: Array,
+    space: Any,
+    output_space: Any,
+    *,
+    alpha: float = 1.0,
+    beta: float = 0.0,
+    kappa: float = 0.0,
+) -> Moments:
+    """`transform` where input or output lie on manifolds, as an attitude does.
+
+    `space` and `output_space` are manifolds or NamedTuples of manifolds (`jaxekf.geometry.manifold`);
+    `mean` is a point of the first, `cov` (n, n) the covariance of its error vector, and `fn` takes
+    points of the first to points of the second. Of the output, errors are counted from ``fn(mean)``,
+    the mean is that point moved by their mean, and the covariance is turned to the new mean by the
+    derivative of the change of origin. That agrees with the mean on the manifold to the order of the
+    transform.
+    """
+    centre = fn(mean)
+
+    def error_of(delta: Array) -> Array:
+        return manifold.local(output_space, centre, fn(manifold.retract(space, mean, delta)))
+
+    cov = jnp.asarray(cov)
+    none = jnp.zeros(manifold.error_dim(space), cov.dtype)
+    found = transform(error_of, none, cov, alpha=alpha, beta=beta, kappa=kappa)
+    turn = manifold.reset_jacobian(output_space, found.mean)
+    return Moments(
+        manifold.retract(output_space, centre, found.mean),
+        linalg.congruence(turn, found.cov),
+        linalg.multiply_transposed(found.cross, turn),
+    )

@@ -1,0 +1,151 @@
+"""Attitude from many directions known in two frames: Davenport's answer to Wahba's problem.
+
+The covariance is Shuster's for QUEST, which solves the same problem. Every function is for one attitude;
+use ``jax.vmap`` for many. Derivatives are finite everywhere, and zero where `Attitude.valid` is False.
+"""
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jaxekf.geometry import linalg, rotation
+from jaxekf.geometry.triad import Attitude, attitude_or, directions, float_type, least_told
+
+
+def q_method(
+    body: Array,
+    reference: Array,
+    weights: Array | None = None,
+    *,
+    near: Array | None = None,
+    fallback: Array | None = None,
+    least_gap: Array | float | None = None,
+) -> Attitude:
+    """Attitude that turns many directions best: Davenport's q-method.
+
+    It is the largest of ``sum(weight * reference . (R @ body))`` over unit vectors: with weights of
+    one over the variance (rad^2) of each direction, the most likely one. `body` and `reference` are
+    (n, 3), n >= 2, of any length; `weights` (n,), equal by default. Zero and non-finite vectors, and
+    those of weight 0, take no part.
+
+    The answer is the eigenvector of the largest eigenvalue of a symmetric 4 by 4 matrix. Where the next
+    eigenvalue is within `least_gap` of it, as a share of all weight, a turn is left open (all
+    directions on one line, or contradictions) and `fallback` (4,) is returned, by default the
+    identity. The default gap is the square root of the rounding error. For the sign see `vectors.triad`.
+
+    First and second derivatives are those of the optimum, not of the eigenvectors that go unused.
+    """
+    b, r, share = _pairs(body, reference, weights)
+    profile = jnp.sum(share[:, None, None] * r[:, :, None] * b[:, None, :], axis=0)
+    values, columns = jnp.linalg.eigh(lax.stop_gradient(_davenport(profile)))
+    told = values[3] - values[2] > least_told(least_gap, profile.dtype)
+    q = jnp.where(told, columns[:, 3], rotation.identity().astype(profile.dtype))
+    profile = jnp.where(told, profile, jnp.eye(3, dtype=profile.dtype))
+    q = _with_derivatives(q, profile)
+    return attitude_or(jnp.where(q[:1] < 0.0, -q, q), told, near, fallback)
+
+
+def q_method_covariance(
+    body: Array,
+    deviations: Array,
+    weights: Array | None = None,
+    *,
+    least_gap: Array | float | None = None,
+) -> Array:
+    """Covariance (3, 3), rad^2, of the attitude error of `q_method`, to first order.
+
+    The error is a rotation vector in the body frame. `body` (n, 3) are the measured vectors, of any
+    length; `deviations` (n,), radians, the standard deviation of each direction across itself, the
+    same both ways, body and reference taken together (the root of the sum of squares); a direction whose
+    deviation is not positive and finite takes no part. With weights
+    of one over their squares, the default, this is Shuster's ``inv(sum((I - b b') / deviation^2))``;
+    any other `weights` (n,), positive, give the covariance of the estimate which they make.
+
+    Where a turn is left open the identity is returned: about one radian, which is nothing known.
+    """
+    deviations = jnp.asarray(deviations, float_type(body, deviations))
+    positive = (deviations > 0.0) & jnp.isfinite(deviations)
+    variances = jnp.where(positive, deviations, 1.0) ** 2
+    chosen = 1.0 / variances if weights is None else jnp.asarray(weights, variances.dtype)
+    b, _, share = _pairs(body, body, jnp.where(positive, chosen, 0.0))
+    across = jnp.eye(3, dtype=b.dtype)[None] - b[:, :, None] * b[:, None, :]
+    information = jnp.sum(share[:, None, None] * across, axis=0)
+    noise = jnp.sum((share * share * variances)[:, None, None] * across, axis=0)
+    # Its eigenvalues add up to 2 and none exceeds 1: the determinant is about the smallest, which is
+    # half the gap of `q_method`.
+    told = 2.0 * _determinant(information) > least_told(least_gap, b.dtype)
+    inverse = _inverse(jnp.where(told, information, jnp.eye(3, dtype=b.dtype)))
+    return jnp.where(told, linalg.congruence(inverse, noise), jnp.eye(3, dtype=b.dtype))
+
+
+def _pairs(body: Array, reference: Array, weights: Array | None) -> tuple[Array, Array, Array]:
+    """Unit vectors (n, 3) of both frames, and the share (n,) of each pair in all weight."""
+    dtype = float_type(body, reference)
+    body, reference = jnp.asarray(body, dtype), jnp.asarray(reference, dtype)
+    if body.ndim != 2 or body.shape[1] != 3 or body.shape != reference.shape:
+        raise ValueError(
+            f"got vectors of shapes {body.shape} and {reference.shape}, expected (n, 3) for both;"
+            " for many attitudes use jax.vmap"
+        )
+    b, body_usable = directions(body)
+    r, reference_usable = directions(reference)
+    weight = jnp.ones(len(b), dtype) if weights is None else jnp.asarray(weights, dtype)
+    used = body_usable & reference_usable & (weight > 0.0) & jnp.isfinite(weight)
+    weight = jnp.where(used, weight, 0.0)
+    total = jnp.sum(weight)
+    return b, r, weight / jnp.where(total > 0.0, total, 1.0)
+
+
+def _davenport(profile: Array) -> Array:
+    """The matrix ``K`` (4, 4), w first, with ``q' K q = sum(share * r . (R(q) @ b))``.
+
+    `profile` is ``sum(share * r b')`` (3, 3).
+    """
+    trace = jnp.trace(profile)
+    z = _axial(profile)
+    lower = profile + profile.T - trace * jnp.eye(3, dtype=profile.dtype)
+    top = jnp.concatenate([trace[None], z])[None]
+    return jnp.concatenate([top, jnp.concatenate([z[:, None], lower], axis=1)])
+
+
+def _axial(profile: Array) -> Array:
+    """``sum(share * cross(b, r))`` of ``sum(share * r b')``."""
+    return jnp.stack(
+        [
+            profile[2, 1] - profile[1, 2],
+            profile[0, 2] - profile[2, 0],
+            profile[1, 0] - profile[0, 1],
+        ]
+    )
+
+
+def _with_derivatives(q: Array, profile: Array) -> Array:
+    """``q``, a constant, as a function of the `profile` for which it is the answer.
+
+    Turned by a rotation vector ``d``, with ``S = R' profile``, the sum which is to be the largest grows
+    by ``d . axial(S) - d' M d / 2``, ``M`` being ``trace(S) I`` less the symmetric part of ``S``. Steps
+    ``inv(M) axial(S)`` change the value by rounding only. Where `profile` changes by a little, q being
+    constant, each brings the answer right to one more order in that, with ``M`` constant as well: two
+    steps give first and second derivatives.
+    """
+    now = linalg.multiply(rotation.to_matrix(q).T, lax.stop_gradient(profile))
+    curvature = jnp.trace(now) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(now)
+    inverse = _inverse(curvature)
+    for _ in range(2):
+        turned = linalg.multiply(rotation.to_matrix(q).T, profile)
+        half_step = 0.5 * jnp.sum(inverse * _axial(turned)[None, :], axis=1)
+        q = rotation.normalise(q + rotation.product(q, rotation.pure(half_step)))
+    return q
+
+
+def _cofactors(matrix: Array) -> Array:
+    a, b, c = matrix
+    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+
+
+def _determinant(matrix: Array) -> Array:
+    return jnp.sum(matrix[0] * _cofactors(matrix)[0])
+
+
+def _inverse(matrix: Array) -> Array:
+    """Inverse (3, 3), without a call to LAPACK."""
+    return _cofactors(matrix).T / _determinant(matrix)

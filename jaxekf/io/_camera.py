@@ -1,0 +1,239 @@
+"""Landmarks in a camera's images on disk: one line for each landmark and image, the places beside them.
+
+``camera.csv``     time,landmark,u,v[,sigma]    pixels
+``landmarks.csv``  landmark,x,y,z               in the reference frame
+
+The lines of an image share exactly one time and stand together. A landmark whose u,v are blank, or that
+has no line, was not found there. The section ``[camera]`` holds `focal` and `centre` (pixels), `radial`,
+`p_body_camera` (m), `q_body_camera`, `latency` (s), and the `unit` of the places in `landmarks.csv`.
+"""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _stream_options as stream_options
+from jaxekf.io import description
+from jaxekf.io._frame_rows import NAMES, bad_name, frames, part_of_each_line
+from jaxekf.io.csv_table import (
+    POSITION,
+    Sheet,
+    Table,
+    finite_numbers,
+    need_columns,
+    numbers,
+    reported,
+    words,
+)
+from jaxekf.recordings import facts, screening
+from jaxekf.recordings.accounts import Indices, Intake, Place
+from jaxekf.recordings.types import Camera, Floats
+
+DESCRIBED = {"kind": "camera", "unit": "m, px"}
+LAYOUT = "time,landmark,u,v[,sigma]"
+LANDMARKS = "landmark,x,y,z"
+HELD = ("latency", "focal", "centre", "radial", "p_body_camera", "q_body_camera")
+_SHOWN = 10
+"""Names of landmarks that a message lists: a scene may have thousands."""
+
+
+def read(table: Table, source: description.Source, landmarks: Table) -> tuple[Camera, Intake]:
+    """The images of `camera.csv`, landmarks in the order of `landmarks.csv`.
+
+    Points of landmarks that were not found are NaN, as are deviations that were not reported. Raises
+    `RecordingError` for a landmark without a place or twice in an image, for times that decrease, for what
+    is not a finite number, and for a camera of which too little is said.
+    """
+    need_columns(table, LAYOUT)
+    about, place = source.about, source.place
+    length, _ = stream_options.factors("camera", about, place)
+    said = optics(about, place, "camera.")
+    names, p_ref_landmark = _places(landmarks, length)
+    pixel, sigma = numbers(table, ("u", "v"), blank=True), reported(table, "sigma")
+    check_sigma(table.place, sigma)
+    landmark = _landmark_of_each_line(table, names, landmarks)
+    columns = [pixel] if sigma is None else [pixel, sigma]
+    made, account = frames(
+        table,
+        columns,
+        landmark,
+        names,
+        sort=source.sort,
+        slowest_s=screening.SLOWEST_TRACKER_S,
+    )
+    found, account = screening.judge_points(
+        table.place.take(made.lines), made.times, pixel[made.lines], account
+    )
+    pixel[made.lines[~found]] = np.nan
+    pixel = made.spread(pixel)
+    stream = Camera(
+        made.time_ns,
+        pixel,
+        np.asarray(np.isfinite(pixel).all(axis=2)),
+        names,
+        p_ref_landmark,
+        sigma=None if sigma is None else made.spread(sigma),
+        latency_ns=description.latency_ns(about, "camera", place),
+        **said,
+    )
+    return stream, account
+
+
+def write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
+    """One line for every landmark of every image, so that no image and no deviation is lost.
+
+    A landmark that is not visible, or has no finite point, gets blank cells. Raises `RecordingError` for
+    what could not be read again.
+    """
+    check_names(Place("camera"), stream.names)
+    check_sigma(Place("camera"), stream.sigma)
+    seen = stream.usable
+    if not seen.any():
+        raise RecordingError(
+            "camera",
+            f"no landmark in any of {len(seen)} images",
+            "at least one",
+            "leaving the stream out where nothing is seen",
+        )
+    columns = ["landmark", "u", "v"]
+    values = [np.where(seen[..., None], stream.pixel, np.nan).reshape(-1, 2)]
+    if stream.sigma is not None:
+        columns.append("sigma")
+        values.append(stream.sigma.reshape(-1, 1))
+    said = {key: getattr(stream, key) for key in HELD if key != "latency"}
+    about |= DESCRIBED | description.latency_entry(stream.latency_ns)
+    about |= {key: value.tolist() for key, value in optics(said, facts.FILE, "camera.").items()}
+    images, count = seen.shape
+    times = np.repeat(stream.time_ns, count)
+    return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * images), about
+
+
+def write_landmarks(stream: Camera, path: Path) -> None:
+    """`landmarks.csv`, to the last bit whatever the digits of samples: a place is no sample."""
+    check_places(Place(path.name), stream.p_ref_landmark)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(LANDMARKS.split(","))
+        for name, point in zip(stream.names, stream.p_ref_landmark, strict=True):
+            writer.writerow([name, *(f"{value:.17g}" for value in point)])
+
+
+def optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[str, Floats]:
+    """Fields of `Camera` that say what it is and where it sits, where they are said.
+
+    Raises `RecordingError`, which names the entry with `head` before it, for a focal length or centre that
+    is not said or none, and a quaternion of zeros; others are scaled to unit length.
+    """
+    found = {}
+    for key in ("focal", "centre"):
+        if key not in said:
+            raise RecordingError(
+                place,
+                f"no {head}{key}",
+                "two numbers of pixels",
+                f"adding {key} = [{key[0]}x, {key[0]}y] under [camera]",
+                column=f"{head}{key}",
+            )
+        found[key] = facts.finite_vector(said[key], 2, place, f"{head}{key}")
+    if (found["focal"] <= 0.0).any():
+        raise RecordingError(
+            place,
+            f"{head}focal = {found['focal'].tolist()}",
+            "two positive numbers of pixels",
+            "turning the image, not the focal length",
+            column=f"{head}focal",
+        )
+    for key, size in (("radial", 2), ("p_body_camera", 3)):
+        if key in said:
+            found[key] = facts.finite_vector(said[key], size, place, f"{head}{key}")
+    if "q_body_camera" in said:
+        key = "q_body_camera"
+        found[key] = facts.unit_vector(said[key], 4, place, f"{head}{key}")
+    return found
+
+
+def check_sigma(place: Place, sigma: Floats | None) -> None:
+    """Deviations (N, ...) are positive, finite, or NaN where none was reported: a point without any error
+    would overrule all else."""
+    if sigma is None:
+        return
+    bad = np.argwhere(np.isinf(sigma) | (sigma <= 0.0))
+    if bad.size:
+        at = tuple(int(i) for i in bad[0])
+        hint = "blanking the cell" if place.unit == "line" else "writing NaN"
+        raise place.error(
+            at[0],
+            "sigma",
+            f"{sigma[at]}",
+            "a finite number of pixels, more than 0",
+            f"{hint}, which means that none was reported",
+        )
+
+
+def check_names(place: Place, names: tuple[str, ...]) -> None:
+    """Each landmark has a name of its own, such as a CSV file can hold, and there is one."""
+    if not names:
+        raise place.error(None, None, "no landmark", "at least one", "giving its name and place")
+    bad = bad_name(names)
+    if bad is not None:
+        raise place.error(bad, "names", repr(names[bad]), NAMES, "renaming the landmark")
+
+
+def check_places(place: Place, places: Floats) -> None:
+    """Every landmark (L, 3) is somewhere."""
+    bad = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    if bad.size:
+        at = int(bad[0])
+        raise place.error(
+            at,
+            "p_ref_landmark",
+            f"{places[at].tolist()}",
+            "3 finite numbers",
+            "giving the landmark its place, or leaving it out",
+        )
+
+
+def _places(table: Table, length: float) -> tuple[tuple[str, ...], Floats]:
+    """Names (L) and places (L, 3), metres, of `landmarks.csv`."""
+    need_columns(table, LANDMARKS)
+    if table.text.cut:
+        raise RecordingError(
+            table.path,
+            "a last line that is cut short",
+            LANDMARKS,
+            "completing the line or removing it",
+            line=table.text.cut[0],
+        )
+    names = tuple(str(name) for name in words(table, "landmark"))
+    bad = bad_name(names)
+    if bad is not None:
+        raise table.error(
+            bad,
+            "landmark",
+            f"{names[bad]!r}" + (" again" if names[bad] in names[:bad] else ""),
+            NAMES,
+            "renaming the landmark, or removing the line",
+        )
+    return names, stream_options.scaled(finite_numbers(table, POSITION), length)
+
+
+def _landmark_of_each_line(table: Table, names: tuple[str, ...], places: Table) -> Indices:
+    """Index (N,) into `names` of the landmark that each line is of."""
+
+    def unknown(row: int, name: str) -> RecordingError:
+        listed = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+        return table.error(
+            row,
+            "landmark",
+            f"landmark '{name}'",
+            f"one whose place is given in {places.path.name} ({listed})",
+            f"adding its line, {LANDMARKS}, to {places.path.name}"
+            if name
+            else "naming the landmark or removing the line",
+        )
+
+    return part_of_each_line(table, "landmark", names, unknown)

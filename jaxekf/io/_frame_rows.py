@@ -1,0 +1,110 @@
+"""Files with one line for each part, such as a marker, of each frame: lines as frames, and what became of
+each part.
+
+The lines of a frame share exactly one time and stand together.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.io.csv_table import Table, stamps, words
+from jaxekf.recordings import screening
+from jaxekf.recordings.accounts import Indices, Intake, Part
+from jaxekf.recordings.types import Flags, Floats, Times
+
+
+class Frames(NamedTuple):
+    """The n lines of a file that are kept, in order of time, and the N frames that they are of."""
+
+    time_ns: Times
+    """(N,) stamps of the frames."""
+    lines: Indices
+    """(n,) which of the file's lines they are, counted from 0."""
+    times: Times
+    """(n,) their stamps."""
+    frame: Indices
+    """(n,) which frame each is of."""
+    part: Indices
+    """(n,) which part each is of."""
+    names: tuple[str, ...]
+    """Of the M parts."""
+
+    def spread(self, values: Floats) -> Floats:
+        """Values (lines of the file, ...) as (N, M, ...), NaN where a frame has no line of a part."""
+        shape = (len(self.time_ns), len(self.names), *values.shape[1:])
+        found = np.full(shape, np.nan)
+        found[self.frame, self.part] = values[self.lines]
+        return found
+
+
+def frames(
+    table: Table,
+    columns: Sequence[Floats],
+    part: Indices,
+    names: tuple[str, ...],
+    *,
+    sort: bool,
+    slowest_s: float = screening.SLOWEST_S,
+) -> tuple[Frames, Intake]:
+    """The frames of a table whose lines are each of a part, and the account of its lines.
+
+    `columns` are all numbers that a line has, by which one that is repeated is told. Raises what
+    `intake.in_order` and `intake.check_rate` do.
+    """
+    every = stamps(table)
+    order, account = screening.in_order(
+        table.place, every, columns, sort=sort, part=part, parts=names
+    )
+    times, kept = every[order], part[order]
+    first: Flags = np.concatenate([[True], np.diff(times) > 0])
+    frame = np.cumsum(first) - 1
+    made = Frames(times[first], order, times, frame, kept, names)
+    screening.check_rate(table.place, made.time_ns, slowest_s)
+    count = np.bincount(part, minlength=len(names))
+    there = np.zeros((len(made.time_ns), len(names)), bool)
+    there[frame, kept] = True
+    gone = np.setdiff1d(np.arange(len(part)), order)
+    parts = {
+        name: Part(int(count[m]), every[gone[part[gone] == m]], made.time_ns[~there[:, m]])
+        for m, name in enumerate(names)
+    }
+    return made, replace(account, parts=parts)
+
+
+def part_of_each_line(
+    table: Table,
+    column: str,
+    names: tuple[str, ...],
+    unknown: Callable[[int, str], RecordingError],
+) -> Indices:
+    """Index (lines,) into `names` of the part that each line is of, by the name in its `column`.
+
+    `unknown` makes the error of a row whose name is none of them.
+    """
+    index = {name: i for i, name in enumerate(names)}
+    cells = words(table, column)
+    kinds, which = np.unique(cells, return_inverse=True)
+    part = np.array([index.get(str(kind), -1) for kind in kinds], np.intp)[which]
+    bad = np.flatnonzero(part < 0)
+    if bad.size:
+        row = int(bad[0])
+        raise unknown(row, str(cells[row]))
+    return part
+
+
+NAMES = "printable names, without blanks at their ends, each once"
+"""What names of parts have to be: what a cell of a CSV file can hold and give back."""
+
+
+def bad_name(names: Sequence[str]) -> int | None:
+    """The first of some names that is none, or is there before; None where all are good."""
+    seen: set[str] = set()
+    for i, name in enumerate(names):
+        if not name or name != name.strip() or not name.isprintable() or name in seen:
+            return i
+        seen.add(name)
+    return None

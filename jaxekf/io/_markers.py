@@ -1,0 +1,144 @@
+"""Single optical markers on disk: one line for each marker and frame, the geometry in `recording.toml`.
+
+``markers.csv``  time,marker,x,y,z[,quality][,error]
+
+The lines of a frame share exactly one time and stand together. A marker whose x,y,z are blank, or that
+has no line, is hidden. The section ``[markers]`` holds `latency` (s), `quality_min`, and
+``[markers.geometry]`` with ``NAME = [x, y, z]``: each marker's place in the body frame, in metres.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _stream_options as stream_options
+from jaxekf.io import description
+from jaxekf.io._frame_rows import NAMES, bad_name, frames, part_of_each_line
+from jaxekf.io.csv_table import POSITION, Sheet, Table, need_columns, numbers, reported
+from jaxekf.recordings import facts, screening
+from jaxekf.recordings.accounts import Indices, Intake
+from jaxekf.recordings.types import Floats, Markers
+
+DESCRIBED = {"kind": "markers", "unit": "m"}
+LAYOUT = "time,marker,x,y,z[,quality][,error]"
+
+
+def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
+    """The frames of `markers.csv`, markers in the order of the geometry.
+
+    Hidden markers are NaN, as are qualities and errors that were not reported. Raises
+    `RecordingError` for a marker without a place in the geometry or twice in a frame, for times that
+    decrease, and for what is not a finite number.
+    """
+    need_columns(table, LAYOUT)
+    about, place = source.about, source.place
+    (length,) = stream_options.factors("markers", about, place)
+    names, p_body_marker = _geometry(about.get("geometry"), place)
+    position = length * numbers(table, POSITION, blank=True)
+    error = reported(table, "error", least=0.0)
+    error = None if error is None else length * error
+    quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
+    columns = [a for a in (position, quality, error) if a is not None]
+    made, account = frames(table, columns, marker, names, sort=source.sort)
+    seen, account = screening.judge_markers(
+        table.place.take(made.lines), made.times, position[made.lines], made.part, account
+    )
+    position[made.lines[~seen]] = np.nan
+    position = made.spread(position)
+    stream = Markers(
+        made.time_ns,
+        position,
+        np.asarray(np.isfinite(position).all(axis=2)),
+        names,
+        p_body_marker,
+        quality=None if quality is None else made.spread(quality),
+        quality_min=facts.finite_number(
+            about.get("quality_min", 0.0), place, "markers.quality_min"
+        ),
+        error=None if error is None else made.spread(error),
+        latency_ns=description.latency_ns(about, "markers", place),
+    )
+    return stream, account
+
+
+def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
+    """One line for every marker of every frame, so that no frame and no reported number is lost.
+
+    A marker that is not visible, or has no finite position, gets blank cells.
+    """
+    _check_names(stream.names, facts.FILE)
+    frames, count = stream.visible.shape
+    seen = stream.visible & np.isfinite(stream.position).all(axis=2)
+    columns = ["marker", *POSITION]
+    values = [np.where(seen[..., None], stream.position, np.nan).reshape(-1, 3)]
+    for key in ("quality", "error"):
+        numbers = getattr(stream, key)
+        if numbers is not None:
+            columns.append(key)
+            values.append(numbers.reshape(-1, 1))
+    about |= DESCRIBED | description.latency_entry(stream.latency_ns)
+    if stream.quality_min:
+        about["quality_min"] = float(stream.quality_min)
+    about["geometry"] = {
+        name: facts.finite_vector(p, 3, facts.FILE, f"markers.geometry.{name}").tolist()
+        for name, p in zip(stream.names, stream.p_body_marker, strict=True)
+    }
+    times = np.repeat(stream.time_ns, count)
+    return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * frames), about
+
+
+def _geometry(geometry: Any, place: Path | str) -> tuple[tuple[str, ...], Floats]:
+    """Names (M) and places in the body (M, 3)."""
+    key = "markers.geometry"
+    if geometry is not None and not isinstance(geometry, dict):
+        raise RecordingError(
+            place, f"{key} = {geometry!r}", "a section", f"writing it as [{key}]", column=key
+        )
+    geometry = geometry or {}
+    _check_names(tuple(geometry), place)
+    places = [facts.finite_vector(p, 3, place, f"{key}.{name}") for name, p in geometry.items()]
+    return tuple(geometry), np.array(places)
+
+
+def _check_names(names: tuple[str, ...], place: Path | str) -> None:
+    """Names are what a cell of a CSV file can hold and give back, each once, and at least one."""
+    key = "markers.geometry"
+    if not names:
+        raise RecordingError(
+            place,
+            "no marker's place in the body",
+            "at least one",
+            f"adding NAME = [x, y, z], in metres, under [{key}]",
+            column=key,
+        )
+    bad = bad_name(names)
+    if bad is not None:
+        raise RecordingError(
+            place,
+            f"{names[bad]!r} as marker {bad + 1}",
+            NAMES,
+            "renaming the marker",
+            column=key,
+        )
+
+
+def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
+    """Index (N,) into `names` of the marker that each line is of."""
+
+    def unknown(row: int, name: str) -> RecordingError:
+        key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+        return table.error(
+            row,
+            "marker",
+            f"marker '{name}'",
+            f"one whose place in the body is given ({', '.join(names)})",
+            f"adding {key} = [x, y, z], in metres, under [markers.geometry] in {facts.FILE}"
+            if name
+            else "naming the marker or removing the line",
+        )
+
+    return part_of_each_line(table, "marker", names, unknown)

@@ -1,0 +1,233 @@
+"""A recorded run as one HDF5 or NPZ file: the same paths in both, to the last bit.
+
+The root says ``kind``, ``schema_version``, ``name``, ``info`` (TOML text) and ``sha256`` (of all values);
+the groups ``optical``, ``markers``, ``camera``, ``imu`` and ``encoder`` hold a stream each. What is said of
+a data set (``unit``, ``frame``) is an attribute in HDF5, and an entry ``optical/time_ns@unit`` in NPZ.
+`container_layout` has the list of data sets, `container_files` reads them.
+
+Whoever writes such a file without ``sha256`` (any program that writes HDF5) has its rows judged like those
+of a CSV file; all that is at the root may be missing then.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.io import _container_schema as layout
+from jaxekf.io import _container_streams as container_streams
+from jaxekf.io import export
+from jaxekf.io._container_arrays import SUFFIXES, of_fixed_length, open_container
+from jaxekf.io.atomic import whole_file
+from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.recordings import facts
+from jaxekf.recordings.accounts import Intake, Place
+from jaxekf.recordings.frozen_poses import without_repeats
+from jaxekf.recordings.types import STREAMS, Recording
+
+_ROOT = ("kind", "schema_version", "name", "info", "sha256")
+_LONGEST_INFO = 60_000
+"""Bytes that an attribute of HDF5 may have, with room for the others."""
+
+
+def is_container(path: Path | str) -> bool:
+    """Whether a path is by its suffix (.h5, .hdf5, .npz) that of a run in one file."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> Path:
+    """Write a run as one file, HDF5 or NPZ by its suffix. Returns its path.
+
+    `load` gives every number again to the last bit, those of hidden rows too. Raises `RecordingError` where
+    the file may not be written, or the run could not be read again.
+    """
+    path = _known(path)
+    entries = _entries(recording, path)
+    data = {key: entry.value for key, entry in entries.items() if key}
+    # Whatever `load` would refuse is refused now, by the same code.
+    _check_declared(path, {key: np.asarray(value) for key, value in data.items()}, {})
+    _assemble(path, entries[""].about, data, sort=False, own=True)
+    if SUFFIXES[path.suffix.lower()] == "npz":
+        entries |= {key: export.Entry(_plain(e.value), e.about) for key, e in entries.items()}
+        with whole_file(path, overwrite=overwrite) as temporary:
+            export.write_npz(temporary, entries)
+    else:
+        entries = {
+            key: export.Entry(
+                of_fixed_length(entry.value),
+                {name: of_fixed_length(said) for name, said in entry.about.items()},
+            )
+            for key, entry in entries.items()
+        }
+        with whole_file(path, overwrite=overwrite) as temporary:
+            export.write_hdf5(temporary, entries)
+    return path
+
+
+def load(path: Path | str, *, sort: bool = False) -> Recording:
+    """Read a run from an HDF5 or NPZ file that `save`, or another program, wrote.
+
+    Of the data sets in `container_layout.LAYOUT` those that are needed must be there, and no unknown ones;
+    other groups are not read. A type is read where no value changes by it: float32, small integers, any
+    integer times that fit, never times as floats. Where ``sha256`` is there it has to be that of the
+    content, which then is taken as it is: only rows that ``valid`` (or ``visible``) says are hidden are
+    masked, and what is not finite. Without it rows are judged as those of a CSV file are (`intake`), and
+    with `sort` put in order of time. `Recording.intake` has the account. Raises `RecordingError`.
+    """
+    path = _known(path)
+    data: dict[str, Any] = {}
+    with open_container(path, STREAMS, _ROOT) as content:
+        said = {key: content.said[key] for key in _ROOT if key in content.said}
+        _check_root(path, said)
+        for label in STREAMS:
+            names = {k.split("/", 1)[1] for k in content.arrays if k.startswith(f"{label}/")}
+            if names:
+                layout.check_names(str(path), label, names)
+        _check_declared(path, content.arrays, content.said)
+        for key, stored in content.arrays.items():
+            data[key] = layout.exact(str(path), key, stored.read(), _field(key))
+    own = "sha256" in said
+    if own and said["sha256"] != (found := layout.content_hash(said, data)):
+        raise RecordingError(
+            path,
+            f"content whose SHA-256 is {found}",
+            f"{said['sha256']}, the attribute sha256 of the file",
+            "copying the file again; after a change on purpose delete the attribute",
+        )
+    recording = _assemble(path, said, data, sort=sort, own=own)
+    if not own:
+        recording = without_repeats(recording)
+    return _noted(recording, content.others)
+
+
+def _known(path: Path | str) -> Path:
+    if not is_container(path):
+        raise RecordingError(
+            path, f"the suffix '{Path(path).suffix}'", ".h5, .hdf5 or .npz", "one of these"
+        )
+    return Path(path)
+
+
+def _field(key: str) -> layout.Field:
+    label, name = key.split("/", 1)
+    return layout.LAYOUT[label][name]
+
+
+def _check_root(path: Path, said: Mapping[str, Any]) -> None:
+    for key, expected in (("kind", layout.KIND), ("schema_version", SCHEMA_VERSION)):
+        if key in said and said[key] != expected:
+            raise RecordingError(
+                f"{path}@{key}", f"{said[key]!r}", f"{expected!r}", "a run written for this version"
+            )
+    for key in ("name", "info", "sha256"):
+        if not isinstance(said.get(key, ""), str):
+            raise RecordingError(f"{path}@{key}", f"{said[key]!r}", "a text", "writing it as one")
+
+
+def _check_declared(path: Path, arrays: Mapping[str, Any], said: Mapping[str, Any]) -> None:
+    """Types, shapes, units and frames are as documented, before any of it is read."""
+    for label in STREAMS:
+        sizes: dict[str, int] = {}
+        # Times and names first: they say how many samples, markers and landmarks there are.
+        keys = [f"{label}/{name}" for name in layout.LAYOUT[label]]
+        for key in (key for key in keys if key in arrays):
+            field, stored = _field(key), arrays[key]
+            layout.check_type(str(path), key, stored.dtype, field)
+            layout.check_shape(str(path), key, stored.shape, field, sizes)
+            about = {a: str(said[f"{key}@{a}"]) for a in ("unit", "frame") if f"{key}@{a}" in said}
+            layout.check_described(str(path), key, about, field)
+
+
+def _assemble(
+    path: Path, said: Mapping[str, Any], data: Mapping[str, Any], *, sort: bool, own: bool
+) -> Recording:
+    """A run of arrays in their types, its rows judged."""
+    streams: dict[str, Any] = {}
+    accounts: dict[str, Intake] = {}
+    for label, make in container_streams.MAKERS.items():
+        group = {k.split("/", 1)[1]: v for k, v in data.items() if k.startswith(f"{label}/")}
+        if group:
+            stream, account = make(Place(f"{path}:{label}"), group, sort)
+            if own:
+                stream = container_streams.as_stored(stream, group)
+            streams[label], accounts[label] = stream, account
+    if not streams:
+        raise RecordingError(
+            path, "no stream", f"one of the groups {', '.join(STREAMS)}", "another file"
+        )
+    info = _info(path, said.get("info", ""))
+    return Recording(
+        str(said.get("name", path.stem)), **streams, info=info, path=path, intake=accounts
+    )
+
+
+def _info(path: Path, text: str) -> dict[str, Any]:
+    try:
+        info = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise RecordingError(
+            f"{path}@info", f"text that is not TOML ({error})", "TOML", "mending it"
+        ) from None
+    return info | facts.known_entries(info, path)
+
+
+def _noted(recording: Recording, others: list[str]) -> Recording:
+    """With a note of what else is in the file, in the account of its first stream."""
+    if not others:
+        return recording
+    first = next(iter(recording.intake))
+    account = recording.intake[first]
+    listed = ", ".join(sorted(others)[:10]) + (", ..." if len(others) > 10 else "")
+    account = replace(
+        account, notes=(*account.notes, f"what else is in the file is not read: {listed}")
+    )
+    return recording.replace(intake={**recording.intake, first: account})
+
+
+def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
+    """What is written, by path; the root first."""
+    info = dict(recording.info)
+    info |= facts.known_entries(info, path)
+    said: dict[str, Any] = {
+        "kind": layout.KIND,
+        "schema_version": SCHEMA_VERSION,
+        "name": recording.name,
+    }
+    try:
+        said["info"] = tomli_w.dumps(info)
+        size = len(f"{recording.name}{said['info']}".encode())
+    except (TypeError, ValueError, AttributeError) as error:
+        raise RecordingError(
+            path, f"info that is no TOML ({error})", "texts, numbers and lists", "changing it"
+        ) from None
+    if size > _LONGEST_INFO:
+        raise RecordingError(
+            path,
+            f"info of {size} bytes",
+            f"at most {_LONGEST_INFO}, which one file has room for",
+            "a folder, which has room for more",
+        )
+    entries: dict[str, export.Entry] = {}
+    for label in STREAMS:
+        stream = getattr(recording, label)
+        for name, field in layout.LAYOUT[label].items() if stream is not None else ():
+            value = getattr(stream, name)
+            if value is not None:
+                key = f"{label}/{name}"
+                raw = np.array(value, object if field.kind == layout.TEXT else None)
+                layout.check_type(str(path), key, raw.dtype, field)
+                entries[key] = export.Entry(
+                    layout.exact(str(path), key, raw, field), field.described
+                )
+    data = {key: entry.value for key, entry in entries.items()}
+    said["sha256"] = layout.content_hash(said, data)
+    return {"": export.Entry(None, said)} | entries
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

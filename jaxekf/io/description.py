@@ -1,0 +1,120 @@
+"""`recording.toml`: what the numbers of a recorded run are."""
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.facts import FILE, as_number, finite_number
+from jaxekf.recordings.types import NANOSECONDS
+
+SCHEMA_VERSION = 1
+LANDMARKS = "landmarks.csv"
+"""The places of what `camera.csv` names."""
+_MENDING = f"correcting {FILE}"
+_LONGEST_LATENCY_S = 3600.0
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """The entries of a folder's `recording.toml`, of a version that is known."""
+    file = folder / FILE
+    if not folder.is_dir():
+        raise RecordingError(folder, "no such folder", "a recorded run's folder", "another path")
+    if not file.is_file():
+        raise RecordingError(
+            file, "no such file", "the description of the run", "writing one (see README)"
+        )
+    try:
+        about = tomllib.loads(file.read_text("utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError, OSError) as error:
+        raise RecordingError(
+            file, f"text that is not TOML ({error})", "TOML", "mending it"
+        ) from error
+    version = about.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise RecordingError(
+            file,
+            f"schema_version {version!r}",
+            f"{SCHEMA_VERSION}",
+            "a run written for this version",
+            column="schema_version",
+        )
+    return about
+
+
+class Source(NamedTuple):
+    """What is said of a stream, and how it is to be read."""
+
+    about: Mapping[str, Any]
+    """Its section of `recording.toml`."""
+    place: Path
+    """That file."""
+    sort: bool
+    """Whether rows that are out of order are sorted."""
+
+
+def check_section(file: Path, label: str, section: Any, known: Mapping[str, str]) -> None:
+    """What is said of a stream's kind and frame is what this version reads, not taken for it."""
+    if not isinstance(section, dict):
+        raise RecordingError(
+            file, f"{label} = {section!r}", "a section", f"[{label}]", column=label
+        )
+    for key, expected in known.items():
+        if key in ("unit", "quaternion"):
+            continue  # `stated` reads these.
+        if key in section and section[key] != expected:
+            raise RecordingError(
+                file,
+                f"{label}.{key} = {section[key]!r}",
+                f"'{expected}'",
+                "converting the file",
+                column=f"{label}.{key}",
+            )
+
+
+def words(
+    about: Mapping[str, Any], label: str, key: str, default: Sequence[str], place: Path | str
+) -> Sequence[str]:
+    """A word or a list of words or numbers."""
+    value = about.get(key, list(default))
+    value = value if isinstance(value, list) else [value]
+    if not all(isinstance(word, str | int | float) for word in value) or not value:
+        name = f"{label}.{key}"
+        raise RecordingError(place, f"{name} = {value!r}", "words", f'{key} = ["ok"]', column=name)
+    return [str(word) for word in value]
+
+
+def limit(about: Mapping[str, Any], label: str, key: str, place: Path | str) -> float:
+    """A positive number that something may not exceed; infinite where none is stated."""
+    if key not in about:
+        return math.inf
+    value = finite_number(about[key], place, f"{label}.{key}")
+    if value <= 0.0:
+        name = f"{label}.{key}"
+        raise RecordingError(
+            place, f"{name} = {value!r}", "a positive number", _MENDING, column=name
+        )
+    return value
+
+
+def latency_ns(about: Mapping[str, Any], label: str, place: Path | str) -> int:
+    """The `latency` of a stream, seconds in the file, to the nanosecond; 0 where none is stated."""
+    value = about.get("latency", 0.0)
+    seconds = as_number(value)
+    if seconds is None or not 0.0 <= seconds <= _LONGEST_LATENCY_S:
+        key = f"{label}.latency"
+        raise RecordingError(
+            place,
+            f"{key} = {value!r}",
+            f"finite seconds, 0 or more, {_LONGEST_LATENCY_S:g} at most",
+            _MENDING,
+            column=key,
+        )
+    return round(seconds * NANOSECONDS)
+
+
+def latency_entry(latency_ns: int) -> dict[str, float]:
+    """The entry that is read as such a latency; none for none."""
+    return {"latency": latency_ns / NANOSECONDS} if latency_ns else {}

@@ -1,0 +1,9 @@
+"""Recordings of other programs, read as `Recording`.
+
+Each public module has a `load`. A new format is a file here and an entry in `formats.FORMATS`.
+"""
+
+from jaxekf._support.lazy import attributes
+
+# Modules are imported when they are first used.
+__getattr__, __dir__ = attributes(__name__, {})

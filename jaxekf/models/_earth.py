@@ -1,0 +1,134 @@
+"""The Earth's gravity and magnetic field as references of attitude: what `triad` and `marg` share.
+
+Up and magnetic north are those that a recording states: ``gravity_ref`` (free fall, by default along -z)
+and ``field_ref``, of which only the horizontal direction counts (by default y: x is east then, y is north,
+z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. How far
+the field dips below the horizontal, and how strong it is, is found from each recording.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.geometry import triad
+from jaxekf.pose_solvers import tilt
+from jaxekf.recordings import facts
+from jaxekf.recordings.accounts import Indices
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Recording
+
+GRAVITY_REF = (0.0, 0.0, -9.80665)
+FIELD_REF = (0.0, 1.0, 0.0)
+_FEWEST = 2
+MOST_HZ = 100.0
+"""Samples of a magnetometer that are used in a second: what is wrong with the field lasts longer."""
+_PAUSE_NS = 500_000_000
+"""A longer step is no sampling period."""
+
+
+class Setup(NamedTuple):
+    """What a recording tells of its run."""
+
+    gravity_ref: Any
+    """(3,) free fall in the reference frame, m/s^2."""
+    field_ref: Any
+    """(3,) unit vector along the magnetic field in the reference frame."""
+
+
+def dipping(up: Floats, north: Floats, dip: float) -> Floats:
+    """(3,) unit vector `dip` radians below a horizontal unit vector."""
+    return np.cos(dip) * north - np.sin(dip) * up
+
+
+SETUP = Setup(
+    np.array(GRAVITY_REF), dipping(np.array([0.0, 0.0, 1.0]), np.array(FIELD_REF), np.deg2rad(60.0))
+)
+
+
+def need_both(recording: Recording) -> Imu:
+    """The IMU's samples whose rate and specific force are finite; its magnetometer may be slower.
+
+    Raises `RecordingError`, which says which of its sensors is not there: one that reads zeros only is not.
+    """
+    imu = recording.need_imu()
+    finite = np.isfinite(imu.gyroscope).all(axis=1)
+    if imu.accelerometer is not None:
+        finite &= np.isfinite(imu.accelerometer).all(axis=1)
+    for name, columns in (("accelerometer", "ax,ay,az"), ("magnetometer", "mx,my,mz")):
+        values = getattr(imu, name)
+        if values is None or not (np.isfinite(values).all(axis=1) & values.any(axis=1)).any():
+            raise RecordingError(
+                recording.path or recording.name,
+                f"an IMU without {name}",
+                "gyroscope, accelerometer and magnetometer for this model",
+                f"adding {columns} to imu.csv, or the model loose where there is a tracker",
+            )
+    assert imu.magnetometer is not None
+    told = np.isfinite(imu.magnetometer).all(axis=1) & imu.magnetometer.any(axis=1)
+    if finite.sum() < _FEWEST or not (told & finite).any():
+        raise RecordingError(
+            recording.path or recording.name,
+            f"{int(finite.sum())} samples of finite rate and specific force,"
+            f" {int((told & finite).sum())} of them with a magnetic field",
+            f"{_FEWEST} or more, and a field in one of them",
+            "a run whose sensors were read together",
+        )
+    if finite.all():
+        return imu
+    left = {key: getattr(imu, key)[finite] for key in imu.per_sample}
+    return replace(imu, time_ns=imu.time_ns[finite], **left)
+
+
+def setup(recording: Recording) -> Setup:
+    """Up and north as a recording states them, and the field's dip as it is felt in the run.
+
+    Raises `RecordingError` where the stated field is vertical, so that it has no north, or where what is
+    stated is no vector, and what `need_both` raises.
+    """
+    known = facts.known_entries(recording.info, recording.path or recording.name)
+    gravity = np.array(known.get("gravity_ref", GRAVITY_REF))
+    stated = np.array(known.get("field_ref", FIELD_REF))
+    up = -gravity / np.linalg.norm(gravity)
+    level = stated - up * (up @ stated)
+    if np.linalg.norm(level) < 1e-6 * np.linalg.norm(stated):
+        raise RecordingError(
+            recording.path or recording.name,
+            f"field_ref = {stated.tolist()}, along gravity_ref",
+            "a field with a horizontal part, which points to magnetic north",
+            "stating another field_ref or gravity_ref in recording.toml",
+            column="field_ref",
+        )
+    dip = float(np.nanmedian(tilt.field(need_both(recording)).dip))
+    return Setup(gravity, dipping(up, level / np.linalg.norm(level), dip))
+
+
+def thinned(imu: Imu, good: Flags) -> Indices:
+    """Rows of an IMU that are good (N,), every n-th so that about `MOST_HZ` are left in a second."""
+    rows = np.flatnonzero(good)
+    steps = np.diff(imu.time_ns[rows])
+    # The mean, for stamps may come in bunches.
+    steps = steps[steps < _PAUSE_NS]
+    if not steps.size:
+        return rows
+    return rows[:: max(1, round(NANOSECONDS / (float(steps.mean()) * MOST_HZ)))]
+
+
+def attitudes(
+    force: Floats, field: Floats, about: Setup, least_sine: float = 1e-6
+) -> triad.Attitude:
+    """Attitudes (N, 4) of specific forces and fields (N, 3), and where they tell one: where the sine of the
+    angle between the two is not below `least_sine`."""
+    return _attitudes(force, field, -about.gravity_ref, about.field_ref, least_sine)
+
+
+@jax.jit
+def _attitudes(
+    force: Array, field: Array, up: Array, field_ref: Array, least_sine: Array
+) -> triad.Attitude:
+    def one(a: Array, b: Array) -> triad.Attitude:
+        return triad.triad(a, b, up, field_ref, least_sine=least_sine)
+
+    return jax.vmap(one)(force, field)

@@ -1,0 +1,215 @@
+"""Pose of a rigid tool from single markers, and gravity from poses and an accelerometer, on the host."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Encoder,
+    Flags,
+    Floats,
+    Imu,
+    Markers,
+    Optical,
+    Times,
+    from_scipy,
+    to_scipy,
+)
+
+START_FIT = 4.0
+"""A run does not start from a frame whose markers fit the tool this much worse than the median."""
+_LARGEST_MISFIT = 0.25
+"""Markers that lie off the tool by more than this share of its size are not those of the tool."""
+_START_S = 1.0
+_START_TURN = 6.0
+_LEAST_TURN = 1e-3
+_LARGEST_SPEED = 3.0
+_LEAST_MARKERS = 3
+_LEAST_SPREAD = 0.05
+"""Markers are on a line where they are this much flatter than long."""
+_LONGEST_STEP_S = 0.2
+_LEAST_GRAVITY_S = 0.5
+
+
+class Fit(NamedTuple):
+    """Rigid fits of many frames."""
+
+    q_ref_body: Floats
+    """(N, 4)."""
+    position: Floats
+    """(N, 3) metres: the body's origin in the reference frame."""
+    error: Floats
+    """(N,) metres: root mean square distance of the markers from the fitted ones."""
+    valid: Flags
+    """(N,) False where fewer than three markers are seen, or all on a line; the rest is then the
+    identity."""
+
+
+def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> Fit:
+    """The pose that takes markers from the body to where they are seen, least squares by SVD.
+
+    `p_body_marker` (M, 3), `position` (N, M, 3) in the reference frame, `usable` (N, M); metres
+    (Arun, Huang, Blostein 1987; Kabsch 1976, so that it is never a reflection).
+    """
+    usable = usable & np.isfinite(position).all(axis=2)
+    count = usable.sum(axis=1)
+    weight = usable / np.maximum(count, 1)[:, None]
+    seen = np.where(usable[..., None], position, 0.0)
+    body = np.broadcast_to(p_body_marker, seen.shape)
+    centre_body = np.einsum("nm,nmi->ni", weight, body)
+    centre_ref = np.einsum("nm,nmi->ni", weight, seen)
+    from_body = body - centre_body[:, None]
+    from_ref = seen - centre_ref[:, None]
+    spread = np.linalg.svd(
+        np.where(usable[..., None], from_body, 0.0), compute_uv=False, full_matrices=False
+    )
+    valid = (count >= _LEAST_MARKERS) & (spread[:, 1] > _LEAST_SPREAD * spread[:, 0])
+    cross = np.einsum("nm,nmi,nmj->nij", weight, from_ref, from_body)
+    cross[~valid] = np.eye(3)
+    u, _, vt = np.linalg.svd(cross)
+    sign = np.ones((len(cross), 3))
+    sign[:, 2] = np.linalg.det(u) * np.linalg.det(vt)
+    matrix = np.einsum("nij,nj,njk->nik", u, sign, vt)
+    origin = centre_ref - np.einsum("nij,nj->ni", matrix, centre_body)
+    off = from_ref - np.einsum("nij,nmj->nmi", matrix, from_body)
+    error = np.sqrt(np.einsum("nm,nmi->n", weight, off**2))
+    origin[~valid], error[~valid] = 0.0, 0.0
+    return Fit(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
+
+
+def fit_markers(markers: Markers, place: object) -> Fit:
+    """The rigid fit of every frame; raises `RecordingError` where the markers are not those of the tool.
+
+    Whatever noise there is, it is small beside the tool: a larger misfit is a wrong unit, wrong names,
+    or the geometry of another tool.
+    """
+    fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
+    if not fit.valid.any():
+        return fit
+    size = float(np.ptp(markers.p_body_marker, axis=0).max())
+    off = float(np.median(fit.error[fit.valid]))
+    if off > _LARGEST_MISFIT * size:
+        raise RecordingError(
+            str(place),
+            f"markers that lie {off:.3g} m off a tool of {size:.3g} m, whatever its pose",
+            f"at most {_LARGEST_MISFIT * size:.2g} m",
+            "metres in markers.csv and in its geometry, and each marker under its own name",
+        )
+    return fit
+
+
+def from_markers(markers: Markers, fit: Fit | None = None) -> Optical:
+    """The raw pose a tracker would report for its markers, frame by frame, without any filter.
+
+    `fit` is that of `fit_markers`, where it is known already.
+    """
+    if fit is None:
+        fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
+    return Optical(
+        markers.time_ns,
+        fit.q_ref_body,
+        fit.valid,
+        fit.position,
+        latency_ns=markers.latency_ns,
+    )
+
+
+def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Floats:
+    """Velocity (3,), m/s, at the valid sample `first`, from the next one; 0 where that is too late."""
+    after = np.flatnonzero(valid[first + 1 :])
+    if after.size == 0:
+        return np.zeros(3)
+    second = first + 1 + int(after[0])
+    step = (times[second] - times[first]) / NANOSECONDS
+    if step > _LONGEST_STEP_S:
+        return np.zeros(3)
+    return (position[second] - position[first]) / step
+
+
+def first_steady(optical: Optical, imu: Imu) -> int | None:
+    """The valid pose to start from: the first of those of the first second that turns to the next as the
+    gyroscope did, and does not jump; where none does, the first of all. None where no pose is valid.
+
+    A tracker that has just found its tool may begin with a wrong pose, which no later one corrects for as
+    long as gates refuse what does not fit.
+    """
+    seen = np.flatnonzero(optical.valid)
+    if seen.size == 0:
+        return None
+    times = optical.time_ns[seen] - optical.latency_ns
+    span = np.diff(times) / NANOSECONDS
+    known = (imu.time_ns - times[0]) / NANOSECONDS
+    middle = (times[:-1] - times[0]) / NANOSECONDS + 0.5 * span
+    rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
+    turn = to_scipy(optical.q_ref_body[seen])
+    said = Rotation.from_rotvec(rate * span[:, None])
+    off = (said.inv() * turn[:-1].inv() * turn[1:]).magnitude()
+    near = span <= _LONGEST_STEP_S
+    if not near.any():
+        return int(seen[0])
+    good = near & (off <= max(_LEAST_TURN, _START_TURN * float(np.median(off[near]))))
+    if optical.position is not None:
+        good &= np.linalg.norm(np.diff(optical.position[seen], axis=0), axis=1) <= (
+            _LARGEST_SPEED * span
+        )
+    good &= times[:-1] - times[0] <= _START_S * NANOSECONDS
+    return int(seen[np.argmax(good)]) if good.any() else int(seen[0])
+
+
+def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
+    """Free fall (3,), m/s^2, in the reference frame: what the accelerometer measures besides motion.
+
+    Over every stretch with poses the mean of the accelerometer's readings, turned into the reference
+    frame, is the mean acceleration (the change of velocity) less gravity. The accelerometer's bias goes
+    into the answer as far as the tool did not turn. Raises `RecordingError` where poses are too few.
+    """
+    if imu.accelerometer is None or optical.position is None:
+        raise RecordingError(str(place), "no accelerometer", "one", "a run with ax, ay, az")
+    taken = optical.time_ns - optical.latency_ns
+    arm = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
+    position = optical.position - to_scipy(optical.q_ref_body).apply(arm)
+    path = Encoder(taken, optical.q_ref_body, optical.valid, optical.valid, position)
+    at = encoder_at(path, imu.time_ns)
+    force = to_scipy(at.q_ref_body).apply(imu.accelerometer)
+    t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
+    known = np.concatenate([[0], at.valid.astype(int), [0]])
+    begins, ends = np.flatnonzero(np.diff(known) == 1), np.flatnonzero(np.diff(known) == -1)
+    total, lasted = np.zeros(3), 0.0
+    for begin, end in zip(begins, ends, strict=True):
+        inside = slice(begin, end)
+        if t[end - 1] - t[begin] < _LEAST_GRAVITY_S or at.position is None:
+            continue
+        where = at.position[inside]
+        start, stop, span = _end_velocities(t[inside], where)
+        chosen = (t[inside] >= span[0]) & (t[inside] <= span[1])
+        seconds = t[inside][chosen]
+        gained = np.trapezoid(force[inside][chosen], seconds, axis=0)
+        total += stop - start - gained
+        lasted += seconds[-1] - seconds[0]
+    if lasted == 0.0:
+        raise RecordingError(
+            str(place),
+            f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from",
+            "one, or gravity_ref = [x, y, z] in recording.toml",
+            "stating free fall in the reference frame of the poses",
+        )
+    return total / lasted
+
+
+def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[float, float]]:
+    """Velocities of straight lines fitted to both ends of a stretch, and the times they hold at."""
+    width = min(0.1, 0.4 * (t[-1] - t[0]))
+    head, tail = t <= t[0] + width, t >= t[-1] - width
+
+    def slope(chosen: Flags) -> tuple[Floats, float]:
+        middle = float(t[chosen].mean())
+        line = np.polynomial.polynomial.polyfit(t[chosen] - middle, position[chosen], 1)
+        return line[1], middle
+
+    start, early = slope(head)
+    stop, late = slope(tail)
+    return start, stop, (early, late)

@@ -1,0 +1,130 @@
+"""Which way is up in the body, when it rests, and how the magnetic field lies to it, before any filter.
+
+From the samples up to an instant, but for what rest looks like and what the gyroscope reads then, which the
+whole run tells. What is found here says how far a magnetometer is to be trusted; no estimate takes an
+attitude from it.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, period_ns
+
+_SETTLING_S = 3.0
+"""Time constant of the low-pass in the frame that does not turn; accelerations of a hand average out."""
+_STILL_S = 1.0
+_STILL_RATE, _STILL_FORCE = np.deg2rad(1.0), 0.3
+"""rad/s and m/s^2: more than any sensor scatters at rest."""
+_QUIETEST, _LOUDER = 0.02, 1.6
+"""Share of the seconds that rest at least, and by how much a scatter at rest may exceed theirs."""
+_LEAST = 0.05
+"""Share of what any sensor scatters that always is rest: readings may repeat to the last bit."""
+_SLOWEST_MEAN = np.deg2rad(2.0)
+"""rad/s: a gyroscope that reads more on average turns, whatever its scatter."""
+
+
+def turned(imu: Imu) -> Floats:
+    """Quaternions (N, 4) that take the body at each sample to the body at the first, by gyroscope alone."""
+    step = np.diff(imu.time_ns) / NANOSECONDS
+    angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
+    half = 0.5 * np.linalg.norm(angle, axis=1)
+    q = np.zeros((len(imu.time_ns), 4))
+    q[0, 0] = 1.0
+    q[1:, 0] = np.cos(half)
+    q[1:, 1:] = 0.5 * angle * np.sinc(half / np.pi)[:, None]
+    # The product of all before each, in a number of passes that grows with the logarithm only.
+    reach = 1
+    while reach < len(q):
+        q[reach:] = _product(q[:-reach], q[reach:])
+        reach *= 2
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
+    """Unit vectors (N, 3): the specific force, low-passed in a frame that does not turn, in the body.
+
+    The low-pass is of second order (Butterworth) and takes `settling_s` seconds. What the gyroscope reads
+    at rest is taken off, where the run rests: what is led on by a bias lags behind by degrees.
+    """
+    # Slow to import, and every model is imported with this module.
+    from scipy.signal import butter, sosfilt, sosfilt_zi
+
+    assert imu.accelerometer is not None
+    resting = still(imu)
+    bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)
+    q = turned(replace(imu, gyroscope=imu.gyroscope - bias))
+    force = _rotate(q, imu.accelerometer)
+    if len(force) == 1:
+        return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
+    rate = NANOSECONDS / max(period_ns(imu.time_ns), 1)
+    corner = min(np.sqrt(2.0) / (2.0 * np.pi * settling_s), 0.4 * rate)
+    sos = butter(2, corner, fs=rate, output="sos")
+    first = force[: max(1, int(0.1 * rate))].mean(axis=0)
+    smooth, _ = sosfilt(sos, force, axis=0, zi=sosfilt_zi(sos)[:, :, None] * first)
+    inside = _rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), smooth)
+    return inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
+
+
+def still(imu: Imu) -> Flags:
+    """(N,) whether the IMU has rested for the last second: readings scatter as little as they ever do.
+
+    What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise
+    is.
+    """
+    width = max(2, int(_STILL_S * NANOSECONDS / max(period_ns(imu.time_ns), 1)))
+    quiet = _quiet(imu.gyroscope, width, _STILL_RATE)
+    quiet &= np.linalg.norm(_trailing(imu.gyroscope, width), axis=1) < _SLOWEST_MEAN
+    if imu.accelerometer is not None:
+        quiet &= _quiet(imu.accelerometer, width, _STILL_FORCE)
+    quiet[: width - 1] = False
+    return quiet
+
+
+class Field(NamedTuple):
+    """The magnetic field as it is felt."""
+
+    norm: Floats
+    """(N,) in the sensor's unit."""
+    dip: Floats
+    """(N,) rad below the horizontal."""
+
+
+def field(imu: Imu) -> Field:
+    """Norm and dip at each sample of a magnetometer; NaN where it was not read."""
+    assert imu.magnetometer is not None
+    norm = np.linalg.norm(imu.magnetometer, axis=1)
+    # Some write zeros for what they did not read.
+    norm = np.where(np.isfinite(norm) & (norm > 0.0), norm, np.nan)
+    with np.errstate(invalid="ignore"):
+        down = -np.sum(imu.magnetometer * up_in_body(imu), axis=1) / norm
+    return Field(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
+
+
+def _quiet(values: Floats, width: int, most: float) -> Flags:
+    """Whether the last `width` of values (N, 3) scatter hardly more than the quietest, and below `most`."""
+    values = values - values.mean(axis=0)
+    spread = _trailing(values**2, width) - _trailing(values, width) ** 2
+    deviation = np.sqrt(np.maximum(spread.max(axis=1), 0.0))
+    own = np.quantile(deviation[width - 1 :], _QUIETEST) if len(values) >= width else 0.0
+    return deviation < np.clip(_LOUDER * own, _LEAST * most, most)
+
+
+def _trailing(values: Floats, width: int) -> Floats:
+    """Mean of the last `width` values, fewer at the start."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    end = np.arange(1, len(values) + 1)
+    begin = np.maximum(end - width, 0)
+    return (total[end] - total[begin]) / (end - begin)[:, None]
+
+
+def _product(p: Floats, q: Floats) -> Floats:
+    w = p[:, 0] * q[:, 0] - np.sum(p[:, 1:] * q[:, 1:], axis=1)
+    v = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
+    return np.concatenate([w[:, None], v], axis=1)
+
+
+def _rotate(q: Floats, vectors: Floats) -> Floats:
+    swing = 2.0 * np.cross(q[:, 1:], vectors)
+    return vectors + q[:, :1] * swing + np.cross(q[:, 1:], swing)

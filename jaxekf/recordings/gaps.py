@@ -1,0 +1,133 @@
+"""A run cut where its IMU has a gap: over it the motion is not known, and nothing is made up."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxekf.recordings.accounts import Intake, Part, Reason
+from jaxekf.recordings.types import NANOSECONDS, STREAMS, Flags, Recording, Times, period_ns
+
+LONGEST_INPUT_GAP_S = 0.1
+"""An input is interpolated over shorter gaps; over longer ones the motion is not known."""
+_SHORTEST_S = 0.5
+"""What is shorter than this between two gaps is not estimated."""
+
+
+def longest_ns(time_ns: Times) -> float:
+    """The longest step between samples of an input that is bridged, ns."""
+    return max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * period_ns(time_ns))
+
+
+def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording]]:
+    """The run itself, or its parts between gaps of the IMU longer than 0.1 s (or three periods).
+
+    Returns what can be estimated and, second, what cannot: parts shorter than half a second, or in which
+    tracker and camera see nothing. Every row of the source belongs to one part: their samples in a gap to
+    the part before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
+    """
+    if recording.imu is None:
+        return [recording], []
+    time = recording.imu.time_ns
+    steps = np.diff(time)
+    at = np.flatnonzero(steps > longest_ns(time))
+    if not at.size:
+        return [recording], []
+    told = ", ".join(
+        f"{steps[i] / NANOSECONDS:.3f} s at {time[i] / NANOSECONDS:.3f} s" for i in at[:5]
+    )
+    more = f" and {len(at) - 5} more" if len(at) > 5 else ""
+    lowest, highest = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+    edges = [lowest, *(int(time[i + 1]) for i in at), highest]
+    good, bad = [], []
+    for k, (begin, end) in enumerate(itertools.pairwise(edges)):
+        part = _part(recording, begin, end)
+        about = f"{k + 1} of {len(edges) - 1} of '{recording.name}', cut at gaps of the IMU: {told}{more}"
+        part = part.replace(
+            name=f"{recording.name}-part{k + 1}", info={**recording.info, "part": about}
+        )
+        (good if _can_be_estimated(part) else bad).append(part)
+    if good and bad:
+        left = "; ".join(
+            f"{part.name} is left out ("
+            + ", ".join(f"{account.rows} rows of {label}" for label, account in part.intake.items())
+            + ")"
+            for part in bad
+        )
+        first = good[0]
+        good[0] = first.replace(info={**first.info, "part": f"{first.info['part']}; {left}"})
+    return good, bad
+
+
+def _can_be_estimated(part: Recording) -> bool:
+    if part.imu is None or np.ptp(part.imu.time_ns) < _SHORTEST_S * NANOSECONDS:
+        return False
+    first, last = part.imu.time_ns[[0, -1]]
+    taken = []
+    if part.optical is not None:
+        taken.append(part.optical.time_ns[part.optical.valid] - part.optical.latency_ns)
+    for stream in (part.markers, part.camera):
+        if stream is not None:
+            seen = stream.usable.any(axis=1)
+            taken.append(stream.time_ns[seen] - stream.latency_ns)
+    return any(bool(((t >= first) & (t <= last)).any()) for t in taken)
+
+
+def _part(recording: Recording, begin: int, end: int) -> Recording:
+    """What was taken from one time to another, the latter not included."""
+    streams: dict[str, Any] = {}
+    intake: dict[str, Intake] = {}
+    for label in STREAMS:
+        stream = getattr(recording, label)
+        if stream is None:
+            continue
+        late = getattr(stream, "latency_ns", 0)
+
+        def inside(stamps: Times, late: int = late) -> Flags:
+            return (stamps - late >= begin) & (stamps - late < end)
+
+        rows = inside(stream.time_ns)
+        streams[label] = None
+        if rows.any():
+            kept = {
+                key: None if getattr(stream, key) is None else getattr(stream, key)[rows]
+                for key in ("time_ns", *stream.per_sample)
+            }
+            streams[label] = replace(stream, **kept)
+        account = recording.intake.get(label)
+        if account is not None:
+            intake[label] = _account_of(account, rows, inside)
+    return recording.replace(**streams, intake=intake)
+
+
+def _account_of(account: Intake, rows: Flags, inside: Any) -> Intake:
+    """The account of the rows of one part."""
+
+    def cut(reasons: Mapping[str, Reason]) -> dict[str, Reason]:
+        found = {}
+        for name, reason in reasons.items():
+            chosen = inside(reason.time_ns)
+            if chosen.any():
+                found[name] = Reason(reason.numbers[chosen], reason.time_ns[chosen])
+        return found
+
+    masked, dropped = cut(account.masked), cut(account.dropped)
+    parts = {}
+    for name, part in account.parts.items():
+        absent, gone = part.absent[inside(part.absent)], part.dropped[inside(part.dropped)]
+        parts[name] = Part(int(rows.sum()) - len(absent) + len(gone), gone, absent)
+    # Masked rows that are none of the stream's samples.
+    there = account.numbers if account.numbers is not None else np.zeros(0, np.intp)
+    out = sum(int((~np.isin(reason.numbers, there)).sum()) for reason in masked.values())
+    if parts:
+        count = sum(part.rows for part in parts.values()) + out
+    else:
+        count = int(rows.sum()) + sum(reason.count for reason in dropped.values()) + out
+    numbers = account.numbers
+    if numbers is not None and len(numbers) == len(rows):
+        numbers = numbers[rows]
+    return replace(
+        account, rows=count, masked=masked, dropped=dropped, parts=parts, numbers=numbers
+    )

@@ -1,0 +1,82 @@
+"""Where the tool went, in three dimensions."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxekf.estimation.result import Estimate
+from jaxekf.evaluation.metrics import rms
+from jaxekf.recordings.types import Encoder, Floats, Recording, to_scipy
+from jaxekf.reporting.plots._sight import Sight, look, truth
+from jaxekf.reporting.plots.style import AXES, ESTIMATE, MEASURED, TRUTH, new_figure, styled
+
+
+class _Paths(NamedTuple):
+    """Points (N, 3) in mm, reference frame."""
+
+    estimated: Floats
+    measured: Floats | None
+    true: Floats | None
+    """NaN where it is not known."""
+
+
+def path(estimate: Estimate, recording: Recording) -> Figure:
+    """3-D path of the body's origin; of a model of attitude alone that of a marker on the tool, which
+    turns about the origin of the tracker's frame."""
+    sight, known = look(estimate, recording), truth(estimate, recording)
+    if "position" in estimate.outputs:
+        paths, what = _moving(estimate, sight, known), "path of the body's origin"
+    else:
+        paths, what = _turning(estimate, recording, sight, known), "path of a marker"
+    title = f"{estimate.run}: {what}"
+    with styled():
+        figure = new_figure((7, 6))
+        axes: Any = figure.add_subplot(projection="3d")
+        if paths.true is not None:
+            axes.plot(*paths.true.T, color=TRUTH, lw=2.2, label="encoder")
+            title += f", error {rms(paths.estimated - paths.true):.2f} mm RMS"
+        if paths.measured is not None:
+            axes.plot(*paths.measured.T, ".", ms=2.5, color=MEASURED, label=sight.label)
+        axes.plot(*paths.estimated.T, color=ESTIMATE, lw=1.2, label="estimate")
+        for name in AXES:
+            getattr(axes, f"set_{name}label")(f"{name} (mm)")
+        _equal_scale(axes, paths.estimated)
+        axes.legend(loc="upper left")
+        figure.suptitle(title)
+    return figure
+
+
+def _moving(estimate: Estimate, sight: Sight, known: Encoder | None) -> _Paths:
+    measured = true = None
+    if sight.pose.position is not None:
+        measured = 1e3 * sight.pose.position[sight.seen]
+    if known is not None and known.position is not None:
+        true = np.where(known.valid[:, None], 1e3 * known.position, np.nan)
+    return _Paths(1e3 * estimate.outputs["position"].value, measured, true)
+
+
+def _turning(
+    estimate: Estimate, recording: Recording, sight: Sight, known: Encoder | None
+) -> _Paths:
+    marker = np.asarray(recording.info["marker_body"], float)
+
+    def turned(q: Floats) -> Floats:
+        return 1e3 * to_scipy(q).apply(marker)
+
+    true, optical = None, recording.optical
+    measured = turned(sight.pose.q_ref_body[sight.seen]) if sight.t.size else None
+    if optical is not None and optical.position is not None:
+        measured = 1e3 * optical.position[sight.seen]
+    if known is not None:
+        true = np.where(known.valid[:, None], turned(known.q_ref_body), np.nan)
+    return _Paths(turned(estimate.attitude.value), measured, true)
+
+
+def _equal_scale(axes: Any, points: Floats) -> None:
+    """The same scale on the three axes, with a little depth where the path is flat."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    reach = 0.55 * float(np.ptp(points, axis=0).max()) + 1e-9
+    for name, centre in zip(AXES, middle, strict=True):
+        getattr(axes, f"set_{name}lim")(centre - reach, centre + reach)
+    axes.set_box_aspect((1, 1, 1))

@@ -1,0 +1,84 @@
+"""Allan deviation of the sensors of a run at rest, with what it is made of."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from jaxekf.calibration.allan import SensorNoise
+from jaxekf.calibration.static_noise import StaticNoise
+from jaxekf.reporting.plots.style import AXES, ESTIMATE, MEASURED, TRUTH, new_grid, styled
+
+_COLOURS = (ESTIMATE, MEASURED, "#6aa84f")
+
+
+def allan(found: StaticNoise) -> Figure:
+    """Deviation over averaging time on logarithmic axes, one panel a sensor, each axis with its 95 % band
+    and the sum of the noise fitted to it, as far as that was used; the slopes of white noise and random
+    walk beside."""
+    sensors = found.sensors
+    with styled():
+        figure, grid = new_grid(1, len(sensors), (5.6 * len(sensors) + 0.4, 5.2))
+        for axes, (label, sensor) in zip(grid[0], sensors.items(), strict=True):
+            turn = 180.0 / np.pi if sensor.unit.startswith("rad") else 1.0
+            _draw(axes, sensor, turn)
+            unit = "deg/s" if turn != 1.0 else "m/s²"
+            axes.set_ylabel(f"Allan deviation of the {label} ({unit})")
+            axes.set_xlabel("averaging time τ (s)")
+        handles, names = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        figure.suptitle(f"{found.run}: {found.imu.duration_s:.1f} s at rest")
+    return figure
+
+
+def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
+    curve = sensor.curve
+    for i, (axis, colour) in enumerate(zip(AXES, _COLOURS, strict=True)):
+        axes.fill_between(
+            curve.tau,
+            turn * curve.low[:, i],
+            turn * curve.high[:, i],
+            color=colour,
+            alpha=0.2,
+            lw=0,
+        )
+        axes.plot(
+            curve.tau, turn * curve.deviation[:, i], "o", color=colour, ms=3, label=f"{axis}, 95 %"
+        )
+    for made, colour in zip(sensor.axes, _COLOURS, strict=True):
+        # Nothing was fitted to what averages less than a period of the highest frequency used.
+        tau = curve.tau[curve.tau >= 0.9 * min(0.5 / made.band_hz, curve.tau[-1])]
+        label = "fit" if colour == _COLOURS[0] else None
+        axes.plot(tau, turn * made.deviation(tau), color=colour, lw=1, label=label)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    # The bands, and not the slopes, are to fill the panel; never less than a decade, so that the scale can
+    # be read.
+    low, high = (
+        turn * float(f(getattr(curve, part))) for f, part in ((np.min, "low"), (np.max, "high"))
+    )
+    if high > 0.0:
+        low = max(low, 1e-6 * high)
+        middle, reach = np.sqrt(low * high), max(1.3 * np.sqrt(high / low), np.sqrt(10.0))
+        axes.set_ylim(middle / reach, middle * reach)
+    axes.set_xlim(curve.tau[0] / 1.2, max(curve.tau[-1] * 1.2, 10.0 * curve.tau[0]))
+    _slopes(axes, sensor, turn)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:.2g}")
+    axes.yaxis.set_minor_formatter("")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.grid(True, which="minor", alpha=0.1)
+
+
+def _slopes(axes: Any, sensor: SensorNoise, turn: float) -> None:
+    """What white noise alone and a random walk alone would give, on the mean of the axes."""
+    tau = np.array(axes.get_xlim())
+    white = turn * float(np.mean(sensor.white))
+    axes.plot(tau, white / np.sqrt(tau), ":", color=TRUTH, lw=1, label="white noise, ∝ 1/√τ")
+    walks = [made.walk.value for made in sensor.axes if made.walk.found]
+    if walks:
+        walk = turn * float(np.mean(walks))
+        axes.plot(
+            tau, walk * np.sqrt(tau / 3.0), "--", color=TRUTH, lw=1, label="random walk, ∝ √τ"
+        )

@@ -1,0 +1,90 @@
+"""What all figures share: colours, bands, legends and files. The only user of matplotlib's settings."""
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imsave
+
+from jaxekf.io.atomic import whole_file
+from jaxekf.recordings.types import Floats
+
+ESTIMATE, MEASURED, TRUTH, HELD = "#0b5394", "#e69138", "#222222", "#a61c00"
+REFUSED, HIDDEN = "#cc0000", "#d9d9d9"
+AXES = ("x", "y", "z")
+_LEGEND_COLUMNS = 7
+STYLE: Any = {
+    "font.size": 9,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "savefig.dpi": 130,
+}
+
+
+def styled() -> AbstractContextManager[None]:
+    """The settings, while a figure is drawn."""
+    return mpl.rc_context(STYLE)
+
+
+def new_figure(size: tuple[float, float]) -> Figure:
+    """An empty figure of `size` inches."""
+    with styled():
+        return Figure(figsize=size, layout="constrained")
+
+
+def new_grid(
+    rows: int, columns: int, size: tuple[float, float], **kwargs: Any
+) -> tuple[Figure, Any]:
+    """A figure of `size` inches with an array (rows, columns) of axes."""
+    with styled():
+        figure = new_figure(size)
+        return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
+
+
+def band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None) -> None:
+    """Two standard deviations about a curve."""
+    axes.fill_between(
+        t, centre - 2 * sigma, centre + 2 * sigma, color=ESTIMATE, alpha=0.22, lw=0, label=label
+    )
+
+
+def symmetric_limits(axes: Any, values: Floats) -> None:
+    """A symmetric range that shows what matters and is not ruled by single outliers."""
+    values = values[np.isfinite(values)]
+    if values.size:
+        bound = 1.3 * np.quantile(np.abs(values), 0.995) + 1e-12
+        axes.set_ylim(-bound, bound)
+
+
+def finish(figure: Figure, grid: Any, title: str) -> None:
+    """Time below every column, the title above, and one legend of all curves at the foot."""
+    for axes in grid[-1]:
+        axes.set_xlabel("time since the start of the estimate (s)")
+    named: dict[str, Any] = {}
+    for axes in grid.flat:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    lines = -(-len(named) // _LEGEND_COLUMNS)
+    columns = -(-len(named) // max(1, lines))
+    figure.legend(
+        list(named.values()), list(named), loc="outside lower center", ncols=max(1, columns)
+    )
+    figure.suptitle(title)
+
+
+def save(figure: Figure, file: Path | str) -> Path:
+    """Write a figure as PNG, whole or not at all; an earlier one is replaced."""
+    canvas = FigureCanvasAgg(figure)
+    with styled(), whole_file(file, overwrite=True) as made:
+        figure.set_dpi(STYLE["savefig.dpi"])
+        # `savefig` lays out and draws twice, once to nowhere: half of the time of a figure.
+        canvas.draw()
+        imsave(made, canvas.buffer_rgba(), format="png", dpi=figure.dpi)
+    return Path(file)

@@ -1,0 +1,122 @@
+"""Figures of honesty: NIS and whiteness of each sensor's innovations, NEES of what an encoder tells."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxekf._support import chi_square
+from jaxekf.evaluation.consistency import BAND
+from jaxekf.evaluation.metrics import normalised_square
+from jaxekf.recordings.types import NANOSECONDS, Floats
+from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
+from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.reporting.report._figures import Figure, shade
+from jaxekf.reporting.report._grid import THIRD, Column, Grid, Place
+
+_ROW = 190
+_ROWS = (ESTIMATE, MEASURED, THIRD, REFUSED)
+_LEAST_DECADE = -2.0
+_PERCENT = f"{100 * BAND:.0f} %"
+_TIME = "time since the start of the estimate (s)"
+
+
+def innovations(seen: Evidence, bins: int) -> Figure | None:
+    """A row for each sensor: NIS over time and, where a diagnosis was saved, autocorrelation over lag."""
+    result = seen.result
+    if not result.sensors:
+        return None
+    judged = (result.diagnosis or {}).get("sensors", {})
+    curves = {
+        name: white
+        for name in result.sensors
+        if (white := judged.get(name, {}).get("whiteness", {})) and white.get("lag_s")
+    }
+    columns = [Column(_TIME, (0.0, float(result.time[-1])), share=1.6 if curves else 1.0)]
+    if curves:
+        longest = max(max(white["lag_s"]) for white in curves.values())
+        columns.append(Column("lag (s)", (0.0, longest), timed=False))
+    grid = Grid(columns, len(result.sensors), row_height=_ROW, bins=bins)
+    shade(grid, seen)
+    for i, (name, sensor) in enumerate(result.sensors.items()):
+        t = (sensor.time_ns - result.time_ns[0]) / NANOSECONDS
+        _squares(grid, Place(i), f"NIS of {name}", sensor.nis, sensor.freedom)
+        fed, out = ~sensor.refused, sensor.refused
+        grid.dots(
+            Place(i), t[fed], _positive(sensor.nis[fed]), name="NIS", colour=ESTIMATE, unit=""
+        )
+        if out.any():
+            refused = _positive(sensor.nis[out])
+            style: Any = {"colour": REFUSED, "unit": "", "size": 5.0, "symbol": "x"}
+            grid.dots(Place(i), t[out], refused, name="NIS, refused by the gate", **style)
+        if name in curves:
+            _autocorrelation(grid, Place(i, 1), curves[name])
+    grid.key(f"{_PERCENT} of honest ones", ESTIMATE, opacity=0.3)
+    caption = (
+        f"Normalised innovation squared: {_PERCENT} lie in the band where the noise is right; the line is"
+        " their expected mean."
+    )
+    if curves:
+        caption += (
+            f" Autocorrelation of whitened innovations, row by row: within the dashed bounds in {_PERCENT}"
+            " of all lags where the filter is right."
+        )
+    return Figure("innovations", "Innovations", caption, grid.document())
+
+
+def errors(seen: Evidence, bins: int) -> Figure | None:
+    """NEES of each output of which an encoder tells the truth."""
+    result = seen.result
+    known = {name: e for name, e in seen.errors.items() if np.isfinite(e).all(axis=1).any()}
+    if not known:
+        return None
+    columns = [Column(_TIME, (0.0, float(result.time[-1])))]
+    grid = Grid(columns, len(known), row_height=_ROW, bins=bins)
+    shade(grid, seen)
+    for i, (name, error) in enumerate(known.items()):
+        kept = np.isfinite(error).all(axis=1)
+        squares = np.full(len(error), np.nan)
+        squares[kept] = normalised_square(error[kept], result.outputs[name].cov[kept])
+        freedom = np.full(len(error), float(error.shape[1]))
+        _squares(grid, Place(i), f"NEES of {name}", squares, freedom)
+        shown = _positive(squares)
+        grid.line(Place(i), result.time, shown, name="NEES", colour=ESTIMATE, unit="", width=0.9)
+    grid.key(f"{_PERCENT} of honest ones", ESTIMATE, opacity=0.3)
+    caption = (
+        "Normalised error squared against the encoder, at scored samples: above the band the estimate is"
+        " surer than it should be, below it less sure. Unlike innovations, errors last: many"
+        " neighbouring samples tell as much as one."
+    )
+    return Figure("errors", "Errors against their covariance", caption, grid.document())
+
+
+def _squares(grid: Grid, at: Place, title: str, squares: Floats, freedom: Floats) -> None:
+    """Axis, chi-square band and expected mean of normalised squares."""
+    common = float(np.bincount(freedom.astype(int)).argmax()) or 1.0
+    low, high = (float(edge) for edge in chi_square.ppf([0.5 - BAND / 2, 0.5 + BAND / 2], common))
+    known = squares[np.isfinite(squares) & (squares > 0)]
+    least = float(np.quantile(known, 0.01)) if known.size else low
+    most = float(known.max()) if known.size else high
+    decades = np.log10([min(low, max(least, 10.0**_LEAST_DECADE)), 1.5 * max(high, most)])
+    grid.axis(at, title, (float(decades[0]) - 0.1, float(decades[1])), log=True)
+    grid.band(at, low, high)
+    grid.level(at, common, TRUTH)
+
+
+def _positive(squares: Floats) -> Floats:
+    """What a logarithmic axis can show."""
+    return np.where(squares > 0, squares, np.nan)
+
+
+def _autocorrelation(grid: Grid, at: Place, white: Mapping[str, Any]) -> None:
+    lag, rows = np.array(white["lag_s"], float), np.array(white["autocorrelation"], float)
+    bound = np.array(white["bound"], float)
+    reach = max(0.1, 1.15 * float(np.abs(rows).max(initial=0.0)), 1.5 * float(bound.max()))
+    grid.axis(at, "autocorrelation", (-reach, reach))
+    labels = ("x", "y", "z") if len(rows) == 3 else [str(i) for i in range(len(rows))]
+    for i, (label, row) in enumerate(zip(labels, rows, strict=True)):
+        style: Any = {"colour": _ROWS[i % len(_ROWS)], "unit": "", "width": 1.1}
+        grid.line(at, lag, row, name=f"row {label}", **style)
+    for side in (-1.0, 1.0):
+        style = {"colour": TRUTH, "unit": "", "width": 1.0, "dash": "dash"}
+        grid.line(at, lag, side * bound, name=f"{_PERCENT} bounds", **style)

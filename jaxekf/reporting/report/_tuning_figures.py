@@ -1,0 +1,355 @@
+"""Figures of a tuning: its search, runs before and after it, and how well each number is known."""
+
+import html
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
+from jaxekf.reporting.report._figures import Figure
+from jaxekf.reporting.report._grid import THIRD, axis_style, common_layout
+from jaxekf.reporting.report._tuned import BEST_AT_ONE, HELD, before_and_after, variants
+
+_TOP, _BOTTOM, _ROW, _GAP = 40, 44, 180, 34
+_MOST_NUMBERS = 60
+_MOST_TICKS = 60
+_FAR = 20.0
+_SYMBOLS = ("diamond", "square", "cross", "triangle-up")
+_OTHERS = (THIRD, REFUSED, TRUTH)
+_HONEST = (0.5, 2.0)
+COLUMNS = (
+    ("attitude_rmse_deg", "attitude RMSE", "deg"),
+    ("rate_rmse_deg_s", "rate RMSE", "deg/s"),
+    ("position_rmse_mm", "position RMSE", "mm"),
+    ("nis", "tracker NIS", ""),
+    ("nees", "attitude NEES", ""),
+    ("position_nees", "position NEES", ""),
+)
+"""Columns of the tables of runs, their headings and units."""
+
+
+def draw_tuning(document: dict[str, Any]) -> list[Figure]:
+    """All figures that the record of a tuning can show."""
+    again = any(number["left_open"] for number in document["numbers"])
+    found = [search(document["history"], document["best_iteration"], again=again)]
+    if document["rows"]:
+        found.append(compared("compared", "Runs before and after", document["rows"]))
+    if document["folds"] is not None:
+        found.append(compared("folds", "Held-out runs before and after", document["folds"]["rows"]))
+    return [figure for figure in [*found, intervals(document["numbers"])] if figure]
+
+
+def known_columns(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+    """The columns in which any row has a number."""
+    return [c for c in COLUMNS if any(row[c[0]] is not None for row in rows)]
+
+
+def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False) -> Figure | None:
+    """The objective of training and validation runs against the iteration; `again` where it went on with
+    some numbers back at their start."""
+    kinds = [
+        kind
+        for kind in ("training", "validation")
+        if any(step[kind] is not None and not step["rejected"] for step in history)
+    ]
+    if not kinds:
+        return None
+    numbers = [step["number"] for step in history]
+    data, layout, above = [], _panels(len(kinds)), 0
+    for i, (kind, colour) in enumerate(zip(kinds, (ESTIMATE, MEASURED), strict=False)):
+        y_axis = _axis_of("y", i)
+        values = [None if step["rejected"] else step[kind] for step in history]
+        style: dict[str, Any] = {"type": "scatter", "xaxis": "x", "yaxis": y_axis}
+        line = {"color": colour, "width": 1.4}
+        data.append(
+            style
+            | {"x": numbers, "y": values, "name": kind, "mode": "lines+markers", "line": line}
+            | {"marker": {"color": colour, "size": 5}, "hovertemplate": "%{y}"}
+        )
+        at = [k for k, n in enumerate(numbers) if n == best and values[k] is not None]
+        if at:
+            marker = {"color": THIRD, "size": 13, "symbol": "star"}
+            point = {"x": [best], "y": [values[at[0]]], "name": f"best: iteration {best}"}
+            data.append(
+                style
+                | point
+                | {"mode": "markers", "marker": marker, "hoverinfo": "skip", "showlegend": i == 0}
+                | {"legendgroup": "best"}
+            )
+        if refused := _refused(history, kind):
+            marker = {"color": REFUSED, "size": 8, "symbol": "x"}
+            where = {"x": [x for x, _ in refused], "y": [y for _, y in refused]}
+            data.append(
+                style
+                | where
+                | {"mode": "markers", "marker": marker, "name": "rejected", "showlegend": i == 0}
+                | {"legendgroup": "rejected", "hovertemplate": "not finite"}
+            )
+        limits, logarithmic, more = _limits([v for v in values if v is not None])
+        above += more
+        axis = layout[_key("y", i)]
+        axis |= axis_style(f"objective, {kind}") | {"range": limits, "nticks": 6}
+        axis |= {"type": "log", "exponentformat": "power"} if logarithmic else {}
+    last = max(numbers)
+    layout["xaxis"] = axis_style("iteration") | {
+        "anchor": _axis_of("y", len(kinds) - 1),
+        "range": [-0.02 * max(last, 1) - 0.3, 1.02 * last + 0.3],
+        "tick0": 0,
+        "dtick": max(1, math.ceil(last / 12)),
+        "unifiedhovertitle": {"text": "iteration %{x}"},
+    }
+    layout["hovermode"] = "x unified"
+    caption = (
+        "Each iteration is one evaluation; steps that the search tried and went back from are among them."
+        " The best is told by the validation runs where there are any."
+    )
+    if again:
+        caption += (
+            " What the data leave open went back to its start, and the search went on: lower values before"
+            " that do not count."
+        )
+    if any(step["rejected"] for step in history):
+        caption += " Rejected steps stand at the level of the step before them: they have no value."
+    if above:
+        caption += f" {above} values lie above the range shown."
+    return Figure("search", "The search", caption, {"data": data, "layout": layout})
+
+
+def _refused(history: Sequence[dict[str, Any]], kind: str) -> list[tuple[int, float]]:
+    """Where to draw rejected steps: at the last value before them, or the first after."""
+    known = [step[kind] for step in history if step[kind] is not None and not step["rejected"]]
+    level, found = known[0], []
+    for step in history:
+        if step["rejected"]:
+            found.append((step["number"], level))
+        elif step[kind] is not None:
+            level = step[kind]
+    return found
+
+
+def _limits(values: Sequence[float]) -> tuple[list[float], bool, int]:
+    """Range of an axis, whether it is logarithmic, and how many values lie above it: of steps that went
+    far astray the rest of the search would be a flat line."""
+    low, high = min(values), max(values)
+    if low > 0.0 and high > _FAR * low:
+        return [math.log10(low) - 0.1, math.log10(high) + 0.1], True, 0
+    span = values[0] - low or high - low or abs(low) or 1.0
+    if high - low > _FAR * span:
+        high = low + 2.0 * span
+    margin = 0.08 * (high - low or span)
+    return [low - margin, high + margin], False, sum(v > high for v in values)
+
+
+def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | None:
+    """A dot for each run and variant, one panel for each column; what holds the tracker is in the table."""
+    columns = known_columns([row for row in rows if row["variant"] != HELD])
+    runs = list(dict.fromkeys(row["run"] for row in rows))
+    if not columns:
+        return None
+    wide = min(len(columns), 2)
+    layout = _panels(len(columns), wide)
+    data: list[dict[str, Any]] = []
+    for i, (column, head, unit) in enumerate(columns):
+        place = {"type": "scatter", "xaxis": _axis_of("x", i % wide), "yaxis": _axis_of("y", i)}
+        told = {(row["run"], row["variant"]): row[column] for row in rows}
+        traces = _dots(rows, runs, told, unit)
+        data += [
+            place | {"showlegend": False} | t for t in traces if i == 0 or t["mode"] == "lines"
+        ]
+        data += [place | t | {"showlegend": False} for t in traces if i and t["mode"] != "lines"]
+        axis = layout[_key("y", i)]
+        axis |= axis_style(f"{head} ({unit})" if unit else head)
+        known = [v for t in traces for v in t["y"] if v is not None]
+        axis |= _scale(known, about_one=column in BEST_AT_ONE)
+        if column in BEST_AT_ONE:
+            layout["shapes"] += _honest(place["xaxis"], place["yaxis"])
+    step = math.ceil(len(runs) / _MOST_TICKS)
+    for i in range(wide):
+        lowest = max(k for k in range(len(columns)) if k % wide == i)
+        layout[_key("x", i)] = axis_style("") | {
+            "anchor": _axis_of("y", lowest),
+            "range": [-0.5, len(runs) - 0.5],
+            "tickvals": list(range(0, len(runs), step)),
+            "ticktext": [_safe(run) for run in runs[::step]],
+            "automargin": True,
+            "showgrid": False,
+            "zeroline": False,
+            **({"matches": "x"} if i else {}),
+        }
+    layout["hovermode"] = "closest"
+    caption = "A dot for each run; the tracker held at its last sample is in the table only."
+    if any(column in BEST_AT_ONE for column, _, _ in columns):
+        low, high = _HONEST
+        caption += (
+            " NIS and NEES are 1 (the line) where the uncertainty is honest; the band goes from"
+            f" {low:g} to {high:g}."
+        )
+    return Figure(name, title, caption, {"data": data, "layout": layout})
+
+
+def _dots(
+    rows: Sequence[dict[str, Any]], runs: Sequence[str], told: dict[Any, Any], unit: str
+) -> list[dict[str, Any]]:
+    """Dots of each variant, before them lines from before to after."""
+    first, last = before_and_after(rows)
+    values = {
+        variant: [told.get((run, variant)) for run in runs] for variant in _drawn(rows, first, last)
+    }
+    found = [_links(values[first], values[last])] if first != last else []
+    others = 0
+    for variant, each in values.items():
+        colour, symbol = _OTHERS[others % len(_OTHERS)], _SYMBOLS[others % len(_SYMBOLS)]
+        if variant in (first, last):
+            colour, symbol = ESTIMATE if variant == last else MEASURED, "circle"
+        else:
+            others += 1
+        found.append(
+            {
+                "x": list(range(len(runs))),
+                "y": each,
+                "mode": "markers",
+                "name": _safe(variant),
+                "legendgroup": variant,
+                "showlegend": True,
+                "marker": {"color": colour, "size": 8, "symbol": symbol},
+                "text": [_safe(run) for run in runs],
+                "hovertemplate": f"%{{text}}: %{{y:.4g}} {unit}",
+            }
+        )
+    return found
+
+
+def _drawn(rows: Sequence[dict[str, Any]], first: str, last: str) -> list[str]:
+    """Variants, so that the tuned one lies on top."""
+    others = [name for name in variants(rows) if name not in (HELD, first, last)]
+    return list(dict.fromkeys([*others, first, last]))
+
+
+def _links(first: Sequence[float | None], last: Sequence[float | None]) -> dict[str, Any]:
+    """Lines from before to after, run by run."""
+    x: list[float | None] = []
+    y: list[float | None] = []
+    for i, ends in enumerate(zip(first, last, strict=True)):
+        if None not in ends:
+            x, y = [*x, i, i, None], [*y, *ends, None]
+    line = {"color": "rgba(128,128,128,0.6)", "width": 2}
+    return {"x": x, "y": y, "mode": "lines", "line": line, "hoverinfo": "skip", "showlegend": False}
+
+
+def _scale(values: Sequence[float], *, about_one: bool) -> dict[str, Any]:
+    """Range and ticks of an axis: NIS and NEES about one, others close to what there is; by decades where
+    they range over some."""
+    positive = [v for v in values if v > 0.0]
+    ends = [min(positive, default=1.0), max(positive, default=1.0)]
+    if about_one:
+        ends = [min(ends[0], _HONEST[0]), max(ends[1], _HONEST[1])]
+    elif ends[1] <= _FAR * ends[0]:
+        low, high = min(values, default=0.0), max(values, default=1.0)
+        margin = 0.12 * (high - low) or 0.05 * abs(high) or 1.0
+        return {"range": [low - margin, high + margin], "nticks": 6}
+    low, high = (math.log10(end) for end in ends)
+    decades = range(math.floor(low) - 1, math.ceil(high) + 1)
+    ticks = [c * 10.0**k for k in decades for c in ((1, 2, 5) if high - low < 2.0 else (1,))]
+    inside = [tick for tick in ticks if low - 0.1 <= math.log10(tick) <= high + 0.1]
+    told = {"tickvals": inside, "ticktext": [f"{tick:g}" for tick in inside]}
+    return {"type": "log", "range": [low - 0.1, high + 0.1], **told}
+
+
+def _honest(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
+    """One, and the band about it."""
+    across = {"xref": f"{x_axis} domain", "yref": y_axis, "x0": 0, "x1": 1, "layer": "below"}
+    line = {"type": "line", "y0": 1, "y1": 1, "line": {"color": TRUTH, "width": 1.2}}
+    fill = {"fillcolor": ESTIMATE, "opacity": 0.12, "line": {"width": 0}}
+    low, high = _HONEST
+    return [across | {"type": "rect", "y0": low, "y1": high, **fill}, across | line]
+
+
+def intervals(numbers: Sequence[dict[str, Any]]) -> Figure | None:
+    """Of each logarithm that has an interval, value and interval by its start; nothing where there are too
+    many to read."""
+    shown = [
+        n
+        for n in numbers
+        if n["logarithm"] and n["interval"] and n["start"] and n["tuned"] and min(n["interval"]) > 0
+    ]
+    if not shown or len(shown) > _MOST_NUMBERS:
+        return None
+    value = np.array([n["tuned"] / n["start"] for n in shown])
+    ends = np.array([n["interval"] for n in shown]) / np.array([[n["start"]] for n in shown])
+    names = [_safe(n["name"] + (f" of {n['run']}" if n["run"] else "")) for n in shown]
+    trace = {
+        "type": "scatter",
+        "x": value.tolist(),
+        "y": list(range(len(shown))),
+        "mode": "markers",
+        "marker": {"color": ESTIMATE, "size": 8},
+        "error_x": {
+            "type": "data",
+            "symmetric": False,
+            "array": (ends[:, 1] - value).tolist(),
+            "arrayminus": (value - ends[:, 0]).tolist(),
+            "color": ESTIMATE,
+            "thickness": 1.6,
+        },
+        "customdata": ends.tolist(),
+        "text": names,
+        "hovertemplate": "%{text}: x %{x:.3g} (%{customdata[0]:.3g} to %{customdata[1]:.3g})",
+        "name": "",
+        "showlegend": False,
+    }
+    layout = common_layout(_TOP + _BOTTOM + 26 * len(shown))
+    layout["margin"]["t"] = 10
+    low, high = (float(np.log10(e)) for e in (min(ends.min(), 1.0), max(ends.max(), 1.0)))
+    margin = max(0.05 * (high - low), 0.03)
+    layout["xaxis"] = axis_style("tuned, as a multiple of the start") | {
+        "type": "log",
+        "range": [low - margin, high + margin],
+        "exponentformat": "none",
+    }
+    layout["yaxis"] = axis_style("") | {
+        "range": [len(shown) - 0.4, -0.6],
+        "tickvals": list(range(len(shown))),
+        "ticktext": names,
+        "automargin": True,
+        "zeroline": False,
+    }
+    line = {"type": "line", "xref": "x", "yref": "paper", "x0": 1, "x1": 1, "y0": 0, "y1": 1}
+    layout["shapes"] = [line | {"line": {"color": TRUTH, "width": 1.2, "dash": "dash"}}]
+    layout["hovermode"] = "closest"
+    caption = (
+        "Tuned values and their 95 % intervals as multiples of the start (the dashed line). What the data"
+        " leave open is not shown: it stays at its start."
+    )
+    return Figure(
+        "intervals", "How well they are known", caption, {"data": [trace], "layout": layout}
+    )
+
+
+def _panels(count: int, wide: int = 1) -> dict[str, Any]:
+    """A layout of panels, side by side and above each other, with empty vertical axes."""
+    high = math.ceil(count / wide)
+    inner = high * _ROW + (high - 1) * _GAP
+    layout = common_layout(_TOP + _BOTTOM + inner, (1.0,) * wide)
+    layout["shapes"] = []
+    for i in range(count):
+        top = 1.0 - (i // wide) * (_ROW + _GAP) / inner
+        domain = [round(max(top - _ROW / inner, 0.0), 5), round(top, 5)]
+        layout[_key("y", i)] = {"anchor": _axis_of("x", i % wide), "domain": domain}
+    return layout
+
+
+def _axis_of(kind: str, number: int) -> str:
+    """What Plotly calls the axis of a trace."""
+    return kind if number == 0 else f"{kind}{number + 1}"
+
+
+def _key(kind: str, number: int) -> str:
+    """What Plotly calls the same axis in a layout."""
+    return _axis_of(kind, number).replace(kind, f"{kind}axis", 1)
+
+
+def _safe(name: str) -> str:
+    """A name that Plotly, which knows some HTML, takes as it is."""
+    return html.escape(name, quote=False)

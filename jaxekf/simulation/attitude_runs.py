@@ -1,0 +1,286 @@
+"""Runs with known truth: the paper's experiment, free smooth rotations, and draws from any model.
+
+Every source of randomness is named by an explicit seed or key.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from scipy.spatial.transform import Rotation
+
+from jaxekf.filtering.ekf import inputs_of
+from jaxekf.filtering.model import Model, Parameters
+from jaxekf.filtering.steps import Steps
+from jaxekf.geometry import manifold
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Encoder,
+    Floats,
+    Imu,
+    Optical,
+    Recording,
+    Times,
+    from_scipy,
+    to_scipy,
+)
+
+
+@dataclass(frozen=True)
+class SensorGrade:
+    """How good the simulated sensors are."""
+
+    gyroscope_deg: float = 0.05
+    """White noise of the rate, deg/s/sqrt(Hz)."""
+    bias_walk_deg: float = 0.005
+    """Random walk of the bias, deg/s^2/sqrt(Hz)."""
+    bias_deg: float = 0.5
+    """Standard deviation of the bias at the start, deg/s."""
+    optical_deg: float = 0.3
+    """Tracker attitude noise per axis, deg."""
+    position_mm: float = 0.2
+    """Tracker position noise per axis, mm."""
+    optical_hz: float = 62.5
+    imu_hz: float = 125.0
+    encoder_hz: float = 125.0
+    accelerometer: float | None = None
+    """White noise of the specific force, m/s^2/sqrt(Hz); None for an IMU without."""
+    magnetometer: float | None = None
+    """Noise of the field per axis, share of its norm; None for an IMU without."""
+
+
+GRAVITY_REF = (0.0, 0.0, -9.80665)
+FIELD_REF = (0.0, 0.5, -0.5 * np.sqrt(3.0))
+"""The magnetic field that a simulated IMU feels: north along y, 60 deg below the horizontal."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A smooth attitude over time: roll, pitch and yaw, each a rate and some sinusoids.
+
+    ``q(t) = exp(a_z(t) e_z) exp(a_y(t) e_y) exp(a_x(t) e_x)`` with
+    ``a(t) = rate * ramp(t) + sum(amplitude * sin(2 pi f t + phase))``, less its value at 0.
+    """
+
+    rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Constant rate of each turn, rad/s, from `rest_s` on."""
+    amplitude: Floats | None = None
+    """(3, m) radians."""
+    frequency: Floats | None = None
+    """(3, m) hertz."""
+    phase: Floats | None = None
+    """(3, m) radians."""
+    rest_s: float = 0.0
+    """The body rests this long at the start."""
+
+    def angles(self, t: Floats) -> tuple[Floats, Floats]:
+        """The three turns (N, 3) and their rates, at times t in seconds."""
+        moving = np.maximum(t - self.rest_s, 0.0)[:, None]
+        on = (t >= self.rest_s)[:, None]
+        angle, speed = moving * np.array(self.rate), np.where(on, np.array(self.rate), 0.0)
+        if self.amplitude is None or self.frequency is None or self.phase is None:
+            return angle, speed
+        turn = 2.0 * np.pi * self.frequency
+        argument = turn * moving[:, :, None] + self.phase
+        swing = self.amplitude * (np.sin(argument) - np.sin(self.phase))
+        return (
+            angle + swing.sum(axis=2),
+            speed + on * (self.amplitude * turn * np.cos(argument)).sum(axis=2),
+        )
+
+    def attitude(self, t: Floats) -> tuple[Floats, Floats]:
+        """Quaternions (N, 4) body to reference, and body rates (N, 3) in rad/s."""
+        angle, speed = self.angles(t)
+        x, y, z = (Rotation.from_rotvec(angle[:, [i]] * np.eye(3)[i]) for i in range(3))
+        axes = np.eye(3)
+        rate = (y * x).inv().apply(axes[2]) * speed[:, [2]]
+        rate += x.inv().apply(axes[1]) * speed[:, [1]] + axes[0] * speed[:, [0]]
+        return from_scipy(z * y * x), rate
+
+
+def constant_rate_motion(rate_deg: float = -9.0, rest_s: float = 10.0) -> Motion:
+    """The paper's experiment: a robot joint turns about x at a constant rate after a rest."""
+    return Motion(rate=(np.deg2rad(rate_deg), 0.0, 0.0), rest_s=rest_s)
+
+
+def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> Motion:
+    """A smooth random rotation about all axes, of about `speed_deg` deg/s rms in roll and yaw.
+
+    Pitch stays within 70 deg, so that roll and yaw stay meaningful in a picture.
+    """
+    rng = np.random.default_rng([seed, 1])
+    frequency = rng.uniform(0.15, 0.9, (3, 4))
+    share = rng.dirichlet(np.ones(4), 3)
+    amplitude = np.deg2rad(speed_deg) * np.sqrt(2.0 * share) / (2.0 * np.pi * frequency)
+    amplitude[1] *= min(1.0, np.deg2rad(35.0) / amplitude[1].sum())
+    # cos(phase) = 0: the motion starts from rest without a jump in rate.
+    phase = rng.choice([-0.5, 0.5], (3, 4)) * np.pi
+    return Motion(amplitude=amplitude, frequency=frequency, phase=phase, rest_s=rest_s)
+
+
+def sample_times(hertz: float, duration_s: float, start_ns: int) -> Times:
+    """Regular sampling instants over the run."""
+    count = int(np.floor(duration_s * hertz + 1e-9)) + 1
+    return start_ns + np.round(np.arange(count) / hertz * NANOSECONDS).astype(np.int64)
+
+
+def recording(
+    name: str,
+    motion: Motion,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: SensorGrade | None = None,
+    occlusions: Sequence[tuple[float, float]] = (),
+    dropouts: float = 0.0,
+    start_ns: int = 0,
+    marker_body: tuple[float, float, float] = (0.15, 0.0, 0.10),
+) -> Recording:
+    """Record a motion with a tracker, a gyroscope and an encoder.
+
+    `occlusions` are (start, end) in seconds in which the tracker sees nothing; each of its other
+    samples is lost with probability `dropouts`. The tracker's position is that of a marker at
+    `marker_body` metres on a tool that turns about the origin.
+    """
+    grade = grade or SensorGrade()
+    rng = np.random.default_rng([seed, 0])
+    joint = motion.amplitude is None and sum(r != 0.0 for r in motion.rate) == 1
+    info: dict[str, Any] = {"simulated": True, "seed": seed, "marker_body": list(marker_body)}
+    if joint:
+        axis = [float(r != 0.0) for r in motion.rate]
+        info["encoder_about"] = {"axis": axis, "acts_on": "reference"}
+    if grade.accelerometer is not None:
+        info["gravity_ref"] = list(GRAVITY_REF)
+    if grade.magnetometer is not None:
+        info["field_ref"] = list(FIELD_REF)
+    optical = _optical(motion, grade, rng, duration_s, occlusions, dropouts, start_ns, marker_body)
+    return Recording(
+        name,
+        optical,
+        _earth(motion, grade, seed, _imu(motion, grade, rng, duration_s, start_ns)),
+        _encoder(motion, grade, duration_s, start_ns),
+        info,
+    )
+
+
+def seconds(times: Times) -> Floats:
+    """Seconds since the first."""
+    return (times - times[0]) / NANOSECONDS
+
+
+def _optical(
+    motion: Motion,
+    grade: SensorGrade,
+    rng: np.random.Generator,
+    duration_s: float,
+    occlusions: Sequence[tuple[float, float]],
+    dropouts: float,
+    start_ns: int,
+    marker_body: tuple[float, float, float],
+) -> Optical:
+    times = sample_times(grade.optical_hz, duration_s, start_ns)
+    t = seconds(times)
+    q, _ = motion.attitude(t)
+    noise = np.deg2rad(grade.optical_deg) * rng.standard_normal((len(t), 3))
+    measured = Rotation.from_quat(np.roll(q, -1, axis=1)) * Rotation.from_rotvec(noise)
+    blur = 1e-3 * grade.position_mm * rng.standard_normal((len(t), 3))
+    position = Rotation.from_quat(np.roll(q, -1, axis=1)).apply(marker_body) + blur
+    visible = rng.uniform(size=len(t)) >= dropouts
+    for begin, end in occlusions:
+        visible &= (t < begin) | (t >= end)
+    visible[0] = True
+    return Optical(times, from_scipy(measured), visible, position)
+
+
+def _imu(
+    motion: Motion, grade: SensorGrade, rng: np.random.Generator, duration_s: float, start_ns: int
+) -> Imu:
+    times = sample_times(grade.imu_hz, duration_s, start_ns)
+    t = seconds(times)
+    _, rate = motion.attitude(t)
+    step = np.deg2rad(grade.bias_walk_deg) / np.sqrt(grade.imu_hz)
+    bias = np.deg2rad(grade.bias_deg) * rng.standard_normal(3)
+    bias = bias + np.cumsum(step * rng.standard_normal((len(t), 3)), axis=0)
+    white = np.deg2rad(grade.gyroscope_deg) * np.sqrt(grade.imu_hz)
+    return Imu(times, rate + bias + white * rng.standard_normal((len(t), 3)))
+
+
+def _earth(motion: Motion, grade: SensorGrade, seed: int, imu: Imu) -> Imu:
+    """The IMU with what it feels of gravity and field; it stands where the tool turns about."""
+    rng = np.random.default_rng([seed, 1])
+    q, _ = motion.attitude(seconds(imu.time_ns))
+    into_body = to_scipy(q).inv()
+
+    def felt(vector: Sequence[float], deviation: float) -> Floats:
+        return into_body.apply(vector) + deviation * rng.standard_normal((len(q), 3))
+
+    force = field = None
+    if grade.accelerometer is not None:
+        up = [-g for g in GRAVITY_REF]
+        force = felt(up, grade.accelerometer * np.sqrt(grade.imu_hz))
+    if grade.magnetometer is not None:
+        field = felt(FIELD_REF, grade.magnetometer)
+    return Imu(imu.time_ns, imu.gyroscope, force, field)
+
+
+def _encoder(motion: Motion, grade: SensorGrade, duration_s: float, start_ns: int) -> Encoder:
+    times = sample_times(grade.encoder_hz, duration_s, start_ns)
+    q, _ = motion.attitude(seconds(times))
+    known = np.ones(len(times), bool)
+    return Encoder(times, q, known, known)
+
+
+def draw(
+    model: Model, params: Parameters, start: Any, steps: Steps, key: Array
+) -> tuple[Any, Steps]:
+    """Draw truth and measurements from a model itself, for tests of consistency.
+
+    From the true state `start` the transition is sampled with its process noise and every visible row
+    with its sensor's noise. Returns the states at the end of each substep, leading axes (K, S), and
+    `steps` with the sampled values in place. Works under `vmap`.
+    """
+    steps = jax.tree.map(jnp.asarray, steps)
+    inputs = inputs_of(model, params, steps)
+
+    def measure(x: Any, u: Any, rows: dict[str, Any], key: Array) -> dict[str, Any]:
+        values = {}
+        for i, (name, samples) in enumerate(sorted(rows.items())):
+            sensor = model.sensor(name)
+            noise = sensor.noise(params, samples.aux, samples.dt)
+            error = _correlated(jax.random.fold_in(key, i), noise)
+            expected = sensor.predict(x, u, params, samples.aux)
+            values[name] = manifold.retract(sensor.space, expected, error)
+        return values
+
+    def substep(x: Any, given: Any) -> Any:
+        dt, u, fast, key = given
+        push, look = jax.random.split(key)
+        w = _correlated(push, model.process_noise(params, dt))
+        x = model.transition(x, u, dt, w, params)
+        return x, (x, measure(x, u, fast, look))
+
+    def epoch(x: Any, given: Any) -> Any:
+        dt, u, fast, slow, key = given
+        keys = jax.random.split(key, dt.shape[0] + 1)
+        x, (states, seen) = lax.scan(substep, x, (dt, u, fast, keys[:-1]))
+        last = None if u is None else jax.tree.map(lambda a: a[-1], u)
+        return x, (states, seen, measure(x, last, slow, keys[-1]))
+
+    keys = jax.random.split(key, steps.dt.shape[0])
+    given = (steps.dt, inputs, steps.fast, steps.slow, keys)
+    _, (states, fast, slow) = lax.scan(epoch, start, given)
+    return states, steps._replace(
+        fast={name: steps.fast[name]._replace(value=value) for name, value in fast.items()},
+        slow={name: steps.slow[name]._replace(value=value) for name, value in slow.items()},
+    )
+
+
+def _correlated(key: Array, cov: Array) -> Array:
+    """A normal draw of a covariance that may be singular (zero in a step of no length)."""
+    values, vectors = jnp.linalg.eigh(cov)
+    draw = jax.random.normal(key, cov.shape[:1], cov.dtype)
+    return vectors @ (jnp.sqrt(jnp.maximum(values, 0.0)) * draw)

@@ -1,0 +1,243 @@
+"""Recorded runs of a camera and an IMU that draw an eight before a scene of two textured planes.
+
+The experiment of Hol (2008): an eight of 2.6 m in 5.4 s, drawn again and again, at up to 4 m/s^2 and
+1 rad/s; a camera of 320 by 240 pixels behind a lens of 3.2 mm, at 12.5 Hz; landmarks on a wall and a floor.
+The scene's x points up.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jaxekf.geometry.pinhole import NEAREST
+from jaxekf.recordings.types import (
+    Camera,
+    Encoder,
+    Flags,
+    Floats,
+    Recording,
+    Times,
+    from_scipy,
+    to_scipy,
+)
+from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
+from jaxekf.simulation.marker_runs import ToolGrade, ToolMotion, Unrecorded, tool_imu
+
+PERIOD_S = 5.4
+GRAVITY_REF = np.array([-9.81, 0.0, 0.0])
+IMAGE = (320, 240)
+FOCAL = 213.3
+"""Pixels: 3.2 mm at 15 um a pixel."""
+_TOWARDS_SCENE = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""Body to scene of a body that looks at the wall: its z along the scene's, its x to the right (the scene's
+y), its y down (against the scene's x)."""
+
+
+@dataclass(frozen=True)
+class CameraGrade:
+    """How good camera and IMU are."""
+
+    imu: ToolGrade = field(
+        default_factory=lambda: ToolGrade(
+            gyroscope_deg=0.05,
+            accelerometer_mg=2.0,
+            bias_walk_deg=0.002,
+            accelerometer_walk=1e-3,
+            bias_deg=0.5,
+            accelerometer_bias=0.1,
+            imu_s=0.01,
+        )
+    )
+    camera_hz: float = 12.5
+    points: int = 30
+    """Landmarks that are found in an image at most."""
+    pixel: float = 0.7
+    """Standard deviation of an image point in each direction, pixels."""
+    mismatched: float = 0.0
+    """Share of points that are those of another landmark in the image."""
+    blurred: float = np.inf
+    """rad/s: in images taken while the body turns faster nothing is found."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where the camera is in the body, and its lens."""
+
+    p_body_camera: Floats = field(default_factory=lambda: np.array([0.03, -0.02, 0.05]))
+    q_body_camera: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    radial: Floats = field(default_factory=lambda: np.array([-0.1, 0.01]))
+
+
+@dataclass(frozen=True)
+class Facing(Motion):
+    """A motion about the attitude in which the body looks at the wall."""
+
+    def attitude(self, t: Floats) -> tuple[Floats, Floats]:
+        """As of `Motion`."""
+        q, rate = super().attitude(t)
+        return from_scipy(to_scipy(_TOWARDS_SCENE) * to_scipy(q)), rate
+
+
+def eight(seed: int = 0) -> ToolMotion:
+    """The eight, 2.6 m wide and 1.1 m high, before the wall; `seed` varies how the body sways."""
+    rng = np.random.default_rng([seed, 31])
+    once = 1.0 / PERIOD_S
+    # x up, y along the wall, z to it: sums of a constant (a sinusoid of frequency 0) and sinusoids.
+    amplitude = np.array([[1.4, 0.55], [0.0, 1.3], [-2.6, 0.15]])
+    frequency = np.array([[0.0, 2.0 * once], [0.0, once], [0.0, once]])
+    phase = np.array([[np.pi / 2, 0.0], [np.pi / 2, 0.0], [np.pi / 2, rng.uniform(0.0, 6.28)]])
+    sway = Facing(
+        amplitude=np.deg2rad([[7.0, 3.0], [9.0, 4.0], [8.0, 4.0]]),
+        frequency=np.array([[once, 2.0 * once], [once, 2.0 * once], [once, 3.0 * once]]),
+        phase=rng.uniform(0.0, 2.0 * np.pi, (3, 2)),
+    )
+    return ToolMotion(sway, amplitude, frequency, phase)
+
+
+def shaken(seed: int = 0) -> ToolMotion:
+    """A hand that turns and shakes the camera before the wall, by up to 20 deg and some 2 rad/s: what tells
+    where the camera is in the body."""
+    rng = np.random.default_rng([seed, 34])
+    size = (3, 2)
+    sway = Facing(
+        amplitude=np.deg2rad(rng.uniform(5.0, 8.0, size)),
+        frequency=rng.uniform(0.6, 1.4, size),
+        phase=rng.uniform(0.0, 2.0 * np.pi, size),
+    )
+    place = np.array([[1.4], [0.0], [-2.6]])
+    shake = rng.uniform(0.05, 0.15, size)
+    return ToolMotion(
+        sway,
+        np.concatenate([place, shake], axis=1),
+        np.concatenate([np.zeros((3, 1)), rng.uniform(0.3, 0.8, size)], axis=1),
+        np.concatenate([np.full((3, 1), np.pi / 2), rng.uniform(0.0, 6.28, size)], axis=1),
+    )
+
+
+def resting() -> ToolMotion:
+    """A body that rests at the middle of the eight and looks at the wall."""
+    nothing = np.zeros((3, 1))
+    place, up = np.array([[1.4], [0.0], [-2.6]]), np.full((3, 1), np.pi / 2)
+    still = Facing(amplitude=nothing, frequency=nothing, phase=nothing)
+    return ToolMotion(still, place, nothing, up)
+
+
+def scene(seed: int = 0, count: int = 160) -> Floats:
+    """Landmarks (count, 3), metres: half of them on the wall (z = 0), half on the floor (x = 0)."""
+    rng = np.random.default_rng([seed, 32])
+    wall = count // 2
+    points = np.zeros((count, 3))
+    points[:wall, :2] = rng.uniform([0.1, -3.2], [3.2, 3.2], (wall, 2))
+    points[wall:, 1:] = rng.uniform([-3.2, -2.2], [3.2, 0.0], (count - wall, 2))
+    return points
+
+
+def camera_recording(
+    name: str,
+    motion: ToolMotion | None = None,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: CameraGrade | None = None,
+    mount: Mount | None = None,
+    landmarks: Floats | None = None,
+    blind: tuple[tuple[float, float], ...] = (),
+    start_ns: int = 0,
+) -> Recording:
+    """Record a motion (the eight unless given) as landmarks in images, with an IMU and the true pose.
+
+    `blind` are times, from and to, seconds, without images in which anything is found. The encoder holds
+    the truth at the IMU's instants.
+    """
+    return camera_run(
+        name,
+        motion,
+        seed=seed,
+        duration_s=duration_s,
+        grade=grade,
+        mount=mount,
+        landmarks=landmarks,
+        blind=blind,
+        start_ns=start_ns,
+    )[0]
+
+
+def camera_run(
+    name: str,
+    motion: ToolMotion | None = None,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: CameraGrade | None = None,
+    mount: Mount | None = None,
+    landmarks: Floats | None = None,
+    blind: tuple[tuple[float, float], ...] = (),
+    start_ns: int = 0,
+) -> tuple[Recording, Unrecorded]:
+    """As `camera_recording`, with what else is true."""
+    grade, mount = grade or CameraGrade(), mount or Mount()
+    motion = eight(seed) if motion is None else motion
+    landmarks = scene() if landmarks is None else landmarks
+    rng = np.random.default_rng([seed, 33])
+    imu_ns = sample_times(1.0 / grade.imu.imu_s, duration_s, start_ns)
+    images = sample_times(grade.camera_hz, duration_s, start_ns)
+    camera = _camera(motion, images, landmarks, grade, mount, blind, rng)
+    imu, *biases = tool_imu(motion, imu_ns, rng, grade.imu, GRAVITY_REF)
+    t = seconds(imu_ns)
+    known = np.ones(len(imu_ns), bool)
+    q, _ = motion.attitude.attitude(t)
+    truth = Encoder(imu_ns, q, known, known, motion.position(t))
+    info = {"simulated": True, "seed": seed, "gravity_ref": GRAVITY_REF.tolist()}
+    recording = Recording(name, None, imu, truth, info, camera=camera)
+    return recording, Unrecorded(motion.velocity(t), *biases)
+
+
+def _camera(
+    motion: ToolMotion,
+    taken_ns: Times,
+    landmarks: Floats,
+    grade: CameraGrade,
+    mount: Mount,
+    blind: tuple[tuple[float, float], ...],
+    rng: np.random.Generator,
+) -> Camera:
+    """What is found in each image: of the landmarks inside it so many at random."""
+    t = seconds(taken_ns)
+    q, rate = motion.attitude.attitude(t)
+    body = to_scipy(q)
+    turn = body * to_scipy(mount.q_body_camera)
+    away = motion.position(t) + body.apply(mount.p_body_camera)
+    inside = np.stack([turn.inv().apply(point - away) for point in landmarks], axis=1)
+    exact, there = _image(inside, mount)
+    there &= (np.linalg.norm(rate, axis=1) <= grade.blurred)[:, None]
+    for begin, end in blind:
+        there &= ~((t >= begin) & (t < end))[:, None]
+    order = np.argsort(np.where(there, rng.uniform(size=there.shape), 2.0), axis=1)
+    chosen = np.zeros_like(there)
+    np.put_along_axis(chosen, order[:, : grade.points], True, axis=1)
+    found = chosen & there
+    pixel = exact + grade.pixel * rng.standard_normal(exact.shape)
+    wrong = found & (rng.uniform(size=found.shape) < grade.mismatched)
+    for image in np.flatnonzero(wrong.any(axis=1)):
+        others = np.flatnonzero(there[image])
+        at = np.flatnonzero(wrong[image])
+        pixel[image, at] = exact[image, rng.choice(others, len(at))]
+    pixel[~found] = np.nan
+    names = tuple(f"L{i}" for i in range(len(landmarks)))
+    lens = (np.full(2, FOCAL), np.array(IMAGE) / 2.0, mount.radial)
+    return Camera(
+        taken_ns, pixel, found, names, landmarks, *lens, mount.p_body_camera, mount.q_body_camera
+    )
+
+
+def _image(inside: Floats, mount: Mount) -> tuple[Floats, Flags]:
+    """Image points (N, L, 2) of landmarks (N, L, 3) in the camera's frame, and which lie in the image."""
+    ahead = inside[..., 2] > 10.0 * NEAREST
+    point = inside[..., :2] / np.where(ahead, inside[..., 2], 1.0)[..., None]
+    r2 = np.sum(point * point, axis=-1)
+    # Beyond the corners the distortion would fold points back into the image.
+    ahead &= r2 < 1.1 * np.sum((np.array(IMAGE) / (2.0 * FOCAL)) ** 2) / 0.9**2
+    stretch = 1.0 + (mount.radial[0] + mount.radial[1] * r2) * r2
+    pixel = FOCAL * point * stretch[..., None] + np.array(IMAGE) / 2.0
+    inside_image = ((pixel >= 0.0) & (pixel < np.array(IMAGE))).all(axis=-1)
+    return pixel, ahead & inside_image

@@ -1,0 +1,73 @@
+"""The recordings that come with the package, made by its own simulator.
+
+Seven runs with different motions: the paper's constant rate, and free rotations from slow to fast,
+each with a rest at the start and some occlusions.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxekf.io import run_folder
+from jaxekf.recordings.types import Recording
+from jaxekf.simulation import attitude_runs
+
+FOLDER = Path(__file__).parent / "demo_runs"
+TRAINING = ("free-1", "free-2", "free-3")
+VALIDATION = ("free-4",)
+TESTING = ("constant-rate", "free-5", "free-6")
+
+_GRADE = attitude_runs.SensorGrade(
+    gyroscope_deg=0.05, bias_walk_deg=0.005, bias_deg=0.6, optical_deg=0.3, encoder_hz=62.5
+)
+_START_NS = 1_700_000_000_000_000_000
+_DURATION_S = 24.0
+_SPEEDS_DEG = (20.0, 45.0, 80.0, 35.0, 60.0, 30.0)
+
+
+def paths(names: tuple[str, ...]) -> list[Path]:
+    """Folders of the bundled runs."""
+    return [FOLDER / name for name in names]
+
+
+def make() -> list[Recording]:
+    """The bundled runs, simulated anew; the same bits every time but for rounding in the CSV files."""
+    runs = [
+        attitude_runs.recording(
+            "constant-rate",
+            attitude_runs.constant_rate_motion(rest_s=6.0),
+            seed=100,
+            duration_s=_DURATION_S,
+            grade=_GRADE,
+            occlusions=[(16.0, 16.5)],
+            start_ns=_START_NS,
+        )
+    ]
+    for number, speed in enumerate(_SPEEDS_DEG, start=1):
+        rng = np.random.default_rng([number, 2])
+        begins = np.array([6.0, 12.0, 18.0]) + rng.uniform(0.0, 3.0, 3)
+        runs.append(
+            attitude_runs.recording(
+                f"free-{number}",
+                attitude_runs.free_motion(number, speed_deg=speed),
+                seed=100 + number,
+                duration_s=_DURATION_S,
+                grade=_GRADE,
+                occlusions=[
+                    (b, b + length) for b, length in zip(begins, (0.5, 1.0, 2.0), strict=True)
+                ],
+                dropouts=0.01,
+                start_ns=_START_NS + number * 60_000_000_000,
+            )
+        )
+    return runs
+
+
+def write(folder: Path = FOLDER) -> None:
+    """Write the bundled runs, small: seven digits."""
+    for run in make():
+        run_folder.save(run, folder / run.name, overwrite=True, digits=7)
+
+
+if __name__ == "__main__":
+    write()

@@ -1,0 +1,259 @@
+"""Recorded runs of a tool that moves in six degrees of freedom, seen as single markers, with an IMU."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxekf.models import inertial, tight
+from jaxekf.recordings.types import Encoder, Floats, Imu, Markers, Recording, Times, to_scipy
+from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
+
+GRAVITY_REF = np.array(inertial.STANDARD_GRAVITY)
+_G = 9.80665
+
+
+@dataclass(frozen=True)
+class ToolGrade:
+    """How good IMU and tracker are; the defaults are an ADIS16350 and the tracker of Tobergte (2009)."""
+
+    gyroscope_deg: float = 0.05
+    """White noise of the rate, deg/s/sqrt(Hz)."""
+    accelerometer_mg: float = 1.85
+    """White noise of the specific force, mg/sqrt(Hz)."""
+    bias_walk_deg: float = 0.002
+    """Random walk of the gyroscope's bias, deg/s^2/sqrt(Hz)."""
+    accelerometer_walk: float = 1e-3
+    """Random walk of the accelerometer's bias, m/s^3/sqrt(Hz)."""
+    bias_deg: float = 0.5
+    """Standard deviation of the gyroscope's bias at the start, deg/s."""
+    accelerometer_bias: float = 0.1
+    """Standard deviation of the accelerometer's bias at the start, m/s^2."""
+    marker_mm: float = 0.231
+    """Noise of a marker's position per axis, mm."""
+    imu_s: float = 0.002
+    tracker_s: float = 0.018
+    latency_s: float = 0.034
+    """How long after it was taken a tracker's frame arrives, and is stamped."""
+
+
+@dataclass(frozen=True)
+class ToolMotion:
+    """A smooth pose over time: `Motion` for the attitude, sinusoids for the position."""
+
+    attitude: Motion
+    amplitude: Floats
+    """(3, m) metres."""
+    frequency: Floats
+    """(3, m) hertz."""
+    phase: Floats
+    """(3, m) radians."""
+
+    def position(self, t: Floats) -> Floats:
+        """(N, 3) metres in the reference frame."""
+        return (self.amplitude * np.sin(self._argument(t))).sum(axis=2)
+
+    def velocity(self, t: Floats) -> Floats:
+        """(N, 3), m/s, reference frame."""
+        turning = 2.0 * np.pi * self.frequency
+        return (self.amplitude * turning * np.cos(self._argument(t))).sum(axis=2)
+
+    def acceleration(self, t: Floats) -> Floats:
+        """(N, 3), m/s^2, reference frame."""
+        squared = (2.0 * np.pi * self.frequency) ** 2
+        return -(self.amplitude * squared * np.sin(self._argument(t))).sum(axis=2)
+
+    def _argument(self, t: Floats) -> Floats:
+        return 2.0 * np.pi * self.frequency * t[:, None, None] + self.phase
+
+
+def sinusoidal_motion() -> ToolMotion:
+    """One sinusoid in each of the six degrees of freedom, as in the simulation of Tobergte (2009)."""
+    attitude = Motion(
+        amplitude=np.deg2rad([[10.0], [8.0], [12.0]]),
+        frequency=np.array([[0.3], [0.25], [0.2]]),
+        phase=np.array([[0.0], [1.0], [2.0]]),
+    )
+    return ToolMotion(
+        attitude,
+        np.array([[0.05], [0.04], [0.03]]),
+        np.array([[0.25], [0.3], [0.2]]),
+        np.array([[0.5], [0.0], [1.5]]),
+    )
+
+
+def free_tool_motion(seed: int) -> ToolMotion:
+    """A random smooth hand motion: some 10 cm and 0.5 rad, below 1 Hz."""
+    rng = np.random.default_rng([seed, 2])
+    size = (3, 3)
+    attitude = Motion(
+        amplitude=rng.uniform(0.05, 0.25, size),
+        frequency=rng.uniform(0.1, 0.7, size),
+        phase=rng.uniform(0.0, 2.0 * np.pi, size),
+    )
+    return ToolMotion(
+        attitude,
+        rng.uniform(0.01, 0.05, size),
+        rng.uniform(0.1, 0.7, size),
+        rng.uniform(0.0, 2.0 * np.pi, size),
+    )
+
+
+@dataclass(frozen=True)
+class Tool:
+    """Where the markers sit in the IMU's frame."""
+
+    names: tuple[str, ...] = ("1", "2", "3")
+    p_body_marker: Floats = field(default_factory=tight.L_SHAPE.copy)
+    """(M, 3) metres; by default an L with legs of 10 cm and the IMU at its corner."""
+
+
+Hidden = Sequence[tuple[str, float, float]]
+"""Marker, and from when to when in seconds it is hidden."""
+
+
+def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: float = 0.25) -> Hidden:
+    """From `begin_s` on only one marker is seen at a time, each for `each_s` in turn."""
+    hidden = []
+    count = int(np.ceil((duration_s - begin_s) / each_s))
+    for i in range(count):
+        start = begin_s + i * each_s
+        shown = names[i % len(names)]
+        hidden += [(name, start, start + each_s) for name in names if name != shown]
+    return hidden
+
+
+class Unrecorded(NamedTuple):
+    """What is true at the IMU's instants and in no recording; each (N, 3)."""
+
+    velocity: Floats
+    """m/s, reference frame."""
+    bias: Floats
+    """Of the gyroscope, rad/s."""
+    accelerometer_bias: Floats
+    """m/s^2."""
+
+
+def tool_recording(
+    name: str,
+    motion: ToolMotion,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: ToolGrade | None = None,
+    tool: Tool | None = None,
+    hidden: Hidden = (),
+    start_ns: int = 0,
+) -> Recording:
+    """Record a motion as single markers, stamped on arrival, with an IMU and the true pose.
+
+    The encoder holds the truth at the IMU's instants. All times start at `start_ns`: the first frame is
+    taken there and arrives later by the latency.
+    """
+    return tool_run(
+        name,
+        motion,
+        seed=seed,
+        duration_s=duration_s,
+        grade=grade,
+        tool=tool,
+        hidden=hidden,
+        start_ns=start_ns,
+    )[0]
+
+
+def tool_run(
+    name: str,
+    motion: ToolMotion,
+    *,
+    seed: int,
+    duration_s: float,
+    grade: ToolGrade | None = None,
+    tool: Tool | None = None,
+    hidden: Hidden = (),
+    start_ns: int = 0,
+) -> tuple[Recording, Unrecorded]:
+    """As `tool_recording`, with what else is true."""
+    grade, tool = grade or ToolGrade(), tool or Tool()
+    rng = np.random.default_rng([seed, 6])
+    taken = sample_times(1.0 / grade.tracker_s, duration_s, start_ns)
+    imu_ns = sample_times(1.0 / grade.imu_s, duration_s, start_ns)
+    markers = tool_markers(motion, tool, taken, rng, grade, hidden)
+    q, _ = motion.attitude.attitude(seconds(imu_ns))
+    known = np.ones(len(imu_ns), bool)
+    truth = Encoder(imu_ns, q, known, known, motion.position(seconds(imu_ns)))
+    imu, *biases = tool_imu(motion, imu_ns, rng, grade)
+    info = {"simulated": True, "seed": seed, "gravity_ref": GRAVITY_REF.tolist()}
+    recording = Recording(name, None, imu, truth, info, markers=markers)
+    return recording, Unrecorded(motion.velocity(seconds(imu_ns)), *biases)
+
+
+def tool_markers(
+    motion: ToolMotion,
+    tool: Tool,
+    taken_ns: Times,
+    rng: np.random.Generator,
+    grade: ToolGrade,
+    hidden: Hidden,
+) -> Markers:
+    """What the tracker makes of the tool; hidden markers are NaN."""
+    t = seconds(taken_ns)
+    q, _ = motion.attitude.attitude(t)
+    turned = np.stack([to_scipy(q).apply(place) for place in tool.p_body_marker], axis=1)
+    exact = motion.position(t)[:, None] + turned
+    seen = exact + 1e-3 * grade.marker_mm * rng.standard_normal(exact.shape)
+    visible = np.ones(seen.shape[:2], bool)
+    for name, begin, end in hidden:
+        visible[(t >= begin) & (t < end), tool.names.index(name)] = False
+    seen[~visible] = np.nan
+    latency = round(grade.latency_s * 1e9)
+    return Markers(
+        taken_ns + latency, seen, visible, tool.names, tool.p_body_marker, latency_ns=latency
+    )
+
+
+def tool_imu(
+    motion: ToolMotion,
+    time_ns: Times,
+    rng: np.random.Generator,
+    grade: ToolGrade,
+    gravity_ref: Floats = GRAVITY_REF,
+) -> tuple[Imu, Floats, Floats]:
+    """Gyroscope and accelerometer with white noise, and the biases, which walk, of each."""
+    t = seconds(time_ns)
+    q, rate = motion.attitude.attitude(t)
+    force = to_scipy(q).inv().apply(motion.acceleration(t) - gravity_ref)
+    turning, bias = _biased(
+        rate,
+        rng,
+        grade.imu_s,
+        np.deg2rad(grade.gyroscope_deg),
+        np.deg2rad(grade.bias_walk_deg),
+        np.deg2rad(grade.bias_deg),
+    )
+    pushing, accelerometer_bias = _biased(
+        force,
+        rng,
+        grade.imu_s,
+        1e-3 * _G * grade.accelerometer_mg,
+        grade.accelerometer_walk,
+        grade.accelerometer_bias,
+    )
+    return Imu(time_ns, turning, pushing), bias, accelerometer_bias
+
+
+def _biased(
+    exact: Floats, rng: np.random.Generator, dt: float, white: float, walk: float, start: float
+) -> tuple[Floats, Floats]:
+    """Samples with white noise and a bias that starts at random and walks, and that bias."""
+    first = start * rng.standard_normal(3)
+    steps = walk * np.sqrt(dt) * rng.standard_normal(exact.shape)
+    noise = white / np.sqrt(dt) * rng.standard_normal(exact.shape)
+    bias = first + np.cumsum(steps, axis=0)
+    return exact + bias + noise, bias
+
+
+def raw_yaw(q: Floats) -> Floats:
+    """Heading (N,) in radians of quaternions (N, 4)."""
+    return to_scipy(q).as_euler("ZYX")[:, 0]

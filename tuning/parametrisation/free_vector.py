@@ -1,0 +1,417 @@
+"""Parameters as one free vector in which every value is admissible.
+
+Standard deviations are optimised by their logarithm and full matrices by a triangular factor with
+logarithms on its diagonal, so that Q and R stay positive definite whatever the step. Calibration is
+optimised as a change from its start in a natural unit.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxekf._support.errors import TuningError
+from jaxekf.estimation.parameters import as_arrays, leaf_names
+from jaxekf.filtering.model import Model, Parameters
+from jaxekf.recordings.types import Floats
+from tuning.parametrisation.truth_frame import TRUTH_UNITS
+
+# A step of one in the free vector changes a leaf of calibration or truth by this much, by its unit.
+_NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
+# Standard deviations of weak priors: of a logarithm (a factor of ten), and by unit.
+_WEAK_LOG = 2.3
+_WEAK = {"s": 0.05, "1": 0.05, "rad": 0.1, "m": 0.05, "s/s": 2e-4}
+AXES = ("tied", "each", "full")
+# Nearer to a bound, as a share of the half width, a number does not come.
+_INSIDE = 1.0 - 1e-9
+
+
+@dataclass(frozen=True)
+class Free:
+    """A parameter that may change, and what is known of it beforehand."""
+
+    name: str
+    """A leaf such as ``noise.optical`` or ``calibration.clock_offset``, or a section such as ``noise``."""
+    each_run: bool = False
+    """Whether each run has its own; else all share one."""
+    prior: float | None = None
+    """Standard deviation about the start: of the logarithm for noise and initial belief, else in the
+    parameter's unit. None is weak: a factor of ten, 50 ms, 0.1 rad, 5 %, 5 cm, 200 ppm."""
+    bounds: tuple[float, float] | None = None
+    """Between which it stays, in its unit; not for full matrices of noise."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One free leaf: where it stands, its shape, and how it is parametrised."""
+
+    name: str
+    shape: tuple[int, ...]
+    """Of one run's value."""
+    kind: str
+    """`log`, `factor` or `linear`."""
+    step: float = 1.0
+    runs: int = 0
+    """Number of runs that each have their own; 0 where all share one."""
+    prior: float = _WEAK_LOG
+    """Standard deviation of a free number about its start."""
+    bounds: tuple[float, float] | None = None
+    """Of the free number before `_bend`."""
+    middle: tuple[float, ...] = ()
+    """With bounds: where the numbers of one run start, and where `_bend` changes nothing."""
+
+    @property
+    def each(self) -> int:
+        """Free numbers of one run's value."""
+        if self.kind == "factor":
+            return self.shape[0] * (self.shape[0] + 1) // 2
+        return int(np.prod(self.shape, dtype=int))
+
+    @property
+    def size(self) -> int:
+        """Free numbers."""
+        return self.each * max(self.runs, 1)
+
+    def to_free(self, value: Array) -> Array:
+        """Free numbers of a value, with `runs` on its first axis or not."""
+        if not self.runs:
+            return self._free(value)
+        own = jnp.ndim(value) > len(self.shape)
+        every = value if own else jnp.broadcast_to(value, (self.runs, *self.shape))
+        return jax.vmap(self._free)(every).reshape(-1)
+
+    def from_free(self, free: Array) -> Array:
+        """Value of free numbers, with the runs on the first axis where each has its own."""
+        if not self.runs:
+            return self._value(free)
+        return jax.vmap(self._value)(free.reshape(self.runs, self.each))
+
+    def is_logarithm(self, number: int) -> bool:
+        """Whether one of its free numbers is a logarithm."""
+        diagonal = self.kind == "factor" and number % self.each < self.shape[0]
+        return self.kind == "log" or diagonal
+
+    def straight(self, free: float, number: int) -> float:
+        """One of its free numbers before it was kept between its bounds."""
+        if self.bounds is None:
+            return float(free)
+        middle = np.asarray(self.middle[number % self.each])
+        return float(_bend(jnp.asarray(free), self.bounds, middle))
+
+    def _free(self, value: Array) -> Array:
+        return _unbend(self._straight(value), self.bounds, np.asarray(self.middle))
+
+    def _straight(self, value: Array) -> Array:
+        if self.kind == "log":
+            return jnp.log(value).reshape(-1)
+        if self.kind == "factor":
+            logs = jnp.log(jnp.diagonal(value))
+            rows, columns = np.tril_indices(self.shape[0], -1)
+            return jnp.concatenate([logs, value[rows, columns] / value[rows, rows]])
+        return (value / self.step).reshape(-1)
+
+    def _value(self, free: Array) -> Array:
+        free = _bend(free, self.bounds, np.asarray(self.middle))
+        if self.kind == "log":
+            return jnp.exp(free).reshape(self.shape)
+        if self.kind == "factor":
+            size = self.shape[0]
+            diagonal = jnp.exp(free[:size])
+            rows, columns = np.tril_indices(size, -1)
+            below = free[size:] * diagonal[rows]
+            return jnp.diag(diagonal).at[rows, columns].set(below)
+        return free.reshape(self.shape) * self.step
+
+
+def _bend(free: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
+    """Any number to one between the bounds; at the start it stays what it is, and its slope is one there,
+    so that steps, priors and intervals mean the same with bounds as without."""
+    if bounds is None:
+        return free
+    middle, half, at, reach = _curve(bounds, start)
+    return middle + half * jnp.tanh(at + (free - start) / reach)
+
+
+def _unbend(bent: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
+    if bounds is None:
+        return bent
+    begin = jnp.asarray(start)
+    middle, half, at, reach = _curve(bounds, start)
+    # Covariances that are scaled to the errors may leave the bounds: then as near to them as can be.
+    inside = jnp.clip((bent - middle) / half, -_INSIDE, _INSIDE)
+    return begin + reach * (jnp.arctanh(inside) - at)
+
+
+def _curve(bounds: tuple[float, float], start: Floats) -> tuple[float, float, Floats, Floats]:
+    """Middle and half width of what lies between the bounds, where on the curve the start lies, and the
+    free distance that is one there."""
+    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    share = np.clip((start - middle) / half, -_INSIDE, _INSIDE)
+    return middle, half, np.arctanh(share), half * (1.0 - share**2)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which leaves are free, in the order of the free vector. Hashable, so that it can be static."""
+
+    leaves: tuple[Leaf, ...]
+
+    def to_free(self, params: Parameters) -> Array:
+        """The free vector (n,) of parameters."""
+        values = _by_name(params)
+        return jnp.concatenate(
+            [leaf.to_free(jnp.asarray(values[leaf.name])) for leaf in self.leaves]
+        )
+
+    @property
+    def own(self) -> frozenset[str]:
+        """Names of the leaves of which each run has its own."""
+        return frozenset(leaf.name for leaf in self.leaves if leaf.runs)
+
+    @property
+    def is_own(self) -> Any:
+        """(n,) numbers that belong to one run only."""
+        return np.concatenate([np.full(leaf.size, leaf.runs > 0) for leaf in self.leaves])
+
+    @property
+    def is_truth(self) -> Any:
+        """(n,) numbers that belong to the encoder."""
+        return np.concatenate(
+            [np.full(leaf.size, leaf.name.startswith("truth.")) for leaf in self.leaves]
+        )
+
+    @property
+    def is_logarithm(self) -> Any:
+        """(n,) numbers that are logarithms."""
+        return np.array([leaf.is_logarithm(i) for leaf in self.leaves for i in range(leaf.size)])
+
+    @property
+    def own_of_one_run(self) -> Any:
+        """Which of the numbers that one run is filtered with are its own, as indices."""
+        own = np.concatenate([np.full(leaf.each, leaf.runs > 0) for leaf in self.leaves])
+        return np.flatnonzero(own)
+
+    @property
+    def prior(self) -> Any:
+        """(n,) standard deviation of each free number about its start."""
+        return np.concatenate([np.full(leaf.size, leaf.prior) for leaf in self.leaves])
+
+    def only(self, names: Collection[str]) -> "Layout":
+        """The layout with some of its leaves."""
+        return Layout(tuple(leaf for leaf in self.leaves if leaf.name in names))
+
+    def of_one_run(self) -> "Layout":
+        """The layout of the numbers that one run is filtered with, its own and the shared ones."""
+        return Layout(tuple(replace(leaf, runs=0) for leaf in self.leaves))
+
+    def for_runs_number(self, runs: int) -> "Layout":
+        """The layout for another number of runs."""
+        leaves = (replace(leaf, runs=runs if leaf.runs else 0) for leaf in self.leaves)
+        return Layout(tuple(leaves))
+
+    def index(self, place: Any) -> Any:
+        """(runs, m) where in the free vector the numbers of each run stand, ordered as in `of_one_run`."""
+        rows = []
+        for run in np.asarray(place):
+            row, start = [], 0
+            for leaf in self.leaves:
+                first = start + (int(run) * leaf.each if leaf.runs else 0)
+                row += range(first, first + leaf.each)
+                start += leaf.size
+            rows.append(row)
+        return np.array(rows, int).reshape(len(rows), -1)
+
+    def of_runs(self, params: Parameters, setup: Any, place: Any) -> Parameters:
+        """Parameters of some runs, each leaf with those on its first axis.
+
+        `place` (runs,) says which of the runs that have parameters of their own each is; `setup` has the
+        runs on the first axis already.
+        """
+        shared = params._replace(setup=())
+        leaves = [
+            leaf[place]
+            if name in self.own
+            else jnp.broadcast_to(leaf, (len(place), *jnp.shape(leaf)))
+            for name, leaf in _by_name(shared).items()
+        ]
+        every = jax.tree.unflatten(jax.tree.structure(shared), leaves)
+        return every._replace(setup=setup)
+
+    def one_run(self, params: Parameters, place: int) -> Parameters:
+        """The parameters of one run."""
+        leaves = [
+            leaf[place] if name in self.own else leaf for name, leaf in _by_name(params).items()
+        ]
+        return jax.tree.unflatten(jax.tree.structure(params), leaves)
+
+    def together(self, params: Parameters) -> Parameters:
+        """One set for a run that is none of these: what each run has of its own by its mean, in which
+        deviations are averaged by their logarithms."""
+        kinds = {leaf.name: leaf for leaf in self.leaves if leaf.runs}
+        leaves = []
+        for name, value in _by_name(params).items():
+            if name in kinds:
+                leaf = kinds[name]
+                middle = leaf.to_free(value).reshape(leaf.runs, leaf.each).mean(axis=0)
+                value = replace(leaf, runs=0).from_free(middle)
+            leaves.append(value)
+        return jax.tree.unflatten(jax.tree.structure(params), leaves)
+
+    def from_free(self, free: Array, base: Parameters) -> Parameters:
+        """Parameters with the free leaves of the vector and all others of `base`; those that each run has
+        of its own with the runs on their first axis."""
+        changed, start = {}, 0
+        for leaf in self.leaves:
+            changed[leaf.name] = leaf.from_free(free[start : start + leaf.size])
+            start += leaf.size
+        values = [changed.get(name, value) for name, value in _by_name(base).items()]
+        return jax.tree.unflatten(jax.tree.structure(base), values)
+
+    def labels(self) -> list[str]:
+        """A name for each free number."""
+        names = []
+        for leaf in self.leaves:
+            for i in range(leaf.size):
+                run, entry = divmod(i, leaf.each)
+                name = leaf.name if leaf.each == 1 else f"{leaf.name}[{entry}]"
+                names.append(f"{name} of run {run}" if leaf.runs else name)
+        return names
+
+
+def _by_name(params: Parameters) -> dict[str, Any]:
+    return dict(zip(leaf_names(params), jax.tree.leaves(params), strict=True))
+
+
+def layout(
+    model: Model,
+    params: Parameters,
+    free: Sequence[str | Free] | None = None,
+    runs: int = 0,
+) -> Layout:
+    """The layout of the free leaves; by default all of the noise.
+
+    `free` holds leaf names such as ``noise.optical`` or ``calibration.clock_offset``, the name of a
+    whole section, or `Free`; what is named twice is as it is named last. `runs` is the number of runs that
+    may have parameters of their own. Raises `TuningError` for a name that is none, a start outside its
+    domain or bounds, and a prior or bounds that make no sense.
+    """
+    values = _by_name(params)
+    units = _by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
+    wanted = ["noise"] if free is None else list(free)
+    if not wanted:
+        raise TuningError("got nothing that is free, expected some parameters; name noise, for one")
+    chosen: dict[str, Free] = {}
+    for entry in wanted:
+        asked = entry if isinstance(entry, Free) else Free(entry)
+        found = [n for n in units if n == asked.name or n.startswith(f"{asked.name}.")]
+        if not found:
+            raise TuningError(
+                f"got the free parameter '{asked.name}', expected some of {list(units)};"
+                " check the spelling"
+            )
+        chosen |= dict.fromkeys(found, asked)
+    return Layout(
+        tuple(
+            _leaf(name, np.asarray(values[name]), units[name], asked, runs)
+            for name, asked in chosen.items()
+        )
+    )
+
+
+def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
+    linear = name.startswith(("calibration.", "truth."))
+    step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
+    if not linear:
+        _check_positive(name, value)
+    kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
+    prior = asked.prior
+    if prior is None:
+        prior = _WEAK.get(unit, step) if linear else _WEAK_LOG
+    if not 0.0 < prior < np.inf:
+        raise TuningError(
+            f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
+            " for a weak one"
+        )
+    leaf = Leaf(name, value.shape, kind, step, runs if asked.each_run else 0, prior / step)
+    bounds = _bounds(name, value, kind, step, asked.bounds)
+    if bounds is None:
+        return leaf
+    numbers = replace(leaf, runs=0).to_free(jnp.asarray(value))
+    return replace(leaf, bounds=bounds, middle=tuple(np.asarray(numbers).tolist()))
+
+
+def _bounds(name: str, value: Any, kind: str, step: float, asked: Any) -> Any:
+    """Bounds of the free numbers."""
+    if asked is None:
+        return None
+    low, high = (float(bound) for bound in asked)
+    if not (np.all(low < value) and np.all(value < high)) or kind == "factor":
+        got = "a full matrix" if kind == "factor" else f"a start of {value.tolist()}"
+        raise TuningError(
+            f"got bounds {low} and {high} for {name} with {got}, expected numbers that hold the start"
+            " between them; widen them, or leave them out"
+        )
+    if not np.isfinite(high - low) or (kind == "log" and low <= 0.0):
+        raise TuningError(
+            f"got bounds {low} and {high} for {name}, expected finite numbers, of deviations positive ones;"
+            " give a small or a large number instead"
+        )
+    if kind == "log":
+        return float(np.log(low)), float(np.log(high))
+    return low / step, high / step
+
+
+def _check_positive(name: str, value: Any) -> None:
+    deviations = np.diagonal(value) if value.ndim == 2 else value
+    if not np.all(np.isfinite(deviations) & (deviations > 0.0)):
+        raise TuningError(
+            f"got {name} = {value.tolist()} to start from, expected positive deviations;"
+            " start from a small positive number"
+        )
+
+
+def with_axes(
+    model: Model, params: Parameters, axes: str, free: Sequence[str | Free] | None = None
+) -> Parameters:
+    """The same noise with one deviation for all axes (`tied`), one for `each`, or a `full` factor.
+
+    With `free` (see `layout`) only the leaves that it names are changed.
+    """
+    if axes not in AXES:
+        raise TuningError(f"got axes '{axes}', expected one of {AXES}; choose one")
+
+    def reshape(value: Any, dim: int) -> Any:
+        value = np.asarray(value, float)
+        _check_positive("noise", value)
+        cov = value @ value.T if value.ndim == 2 else np.diag(np.broadcast_to(value, dim) ** 2)
+        if axes == "full":
+            return np.linalg.cholesky(cov)
+        each = np.sqrt(np.diagonal(cov))
+        return each if axes == "each" else np.sqrt(np.mean(each**2))
+
+    chosen = {leaf.name for leaf in layout(model, params, free).leaves}
+    names = [f"noise.{name}" for name in leaf_names(params.noise)]
+    leaves, structure = jax.tree.flatten(params.noise)
+    dims = jax.tree.leaves(model.noise_dims)
+    changed = [
+        reshape(leaf, dim) if free is None or name in chosen else leaf
+        for name, leaf, dim in zip(names, leaves, dims, strict=True)
+    ]
+    return as_arrays(params._replace(noise=jax.tree.unflatten(structure, changed)))
+
+
+SCALED = ("noise.", "initial.")
+"""The sections that `scaled` scales."""
+
+
+def scaled(params: Parameters, factor: float) -> Parameters:
+    """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales."""
+    root = np.sqrt(factor)
+    return params._replace(
+        noise=jax.tree.map(lambda a: a * root, params.noise),
+        initial=jax.tree.map(lambda a: a * root, params.initial),
+    )

@@ -1,0 +1,185 @@
+"""What speaks against a tuning, in sentences: of what its record holds, and so of hand-made records too."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+HONEST_NEES = (0.5, 2.0)
+"""Between which the attitude NEES of a held-out run is taken for honest."""
+_FAR_FACTOR = 10.0
+_FAR_SIGMAS = 3.0
+_NEAR_BOUND = 0.01
+_WORSE = 1.01
+_MOST_NAMED = 6
+_COLUMNS = {
+    "attitude": ("attitude_rmse_deg", "attitude RMSE", "deg"),
+    "rate": ("rate_rmse_deg_s", "rate RMSE", "deg/s"),
+    "position": ("position_rmse_mm", "position RMSE", "mm"),
+}
+
+
+def cautions(record: Mapping[str, Any]) -> list[str]:
+    """Sentences on what a reader of `tuning.persistence.tuning_document.record` should know before
+    using the numbers; empty where nothing speaks against them."""
+    judges: tuple[Callable[[Mapping[str, Any]], Iterable[str]], ...] = (
+        _unseen,
+        _ended,
+        _left_open,
+        _far,
+        _bounded,
+        _scaled,
+        _worse,
+        _honest,
+    )
+    return [sentence for judge in judges for sentence in judge(record)]
+
+
+def before(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The variant that stands for the time before the tuning: ``start``, or the first that is neither the
+    tracker held nor tuned; empty where there is none."""
+    variants = list(dict.fromkeys(row["variant"] for row in rows))
+    others = [name for name in variants if name not in ("hold last", "tuned")]
+    return "start" if "start" in variants else others[0] if others else ""
+
+
+def _unseen(record: Mapping[str, Any]) -> Iterable[str]:
+    if record["validation_runs"] or record["folds"] or record["judged_on"] == "other runs":
+        return
+    how = "was compared on" if record["rows"] else "was judged by"
+    yield (
+        f"No run was held out: the tuning {how} the training runs themselves, which flatters it; name"
+        " validation runs, or ask for folds"
+    )
+
+
+def _ended(record: Mapping[str, Any]) -> Iterable[str]:
+    stopped = record["stopped"]
+    if "iterations asked for" in stopped:
+        yield f"The search did not converge: {stopped}; ask for more"
+    elif "interrupted" in stopped:
+        yield f"The search did not converge: {stopped}"
+    if count := record["rejected_steps"]:
+        steps = "1 step was" if count == 1 else f"{count} steps were"
+        yield f"{steps} not finite and rejected: the search went where the filter fails"
+
+
+def _left_open(record: Mapping[str, Any]) -> Iterable[str]:
+    by_motion: dict[str, list[str]] = {}
+    for number in record["numbers"]:
+        if number["left_open"]:
+            by_motion.setdefault(number["would_tell"], []).append(called(number))
+    for motion, names in by_motion.items():
+        what = "it stays at its" if len(names) == 1 else "they stay at their"
+        yield f"The data leave {_listed(names)} open, so that {what} start: {motion} would tell"
+
+
+def _far(record: Mapping[str, Any]) -> Iterable[str]:
+    for number in record["numbers"]:
+        change = number["change"]
+        if number["logarithm"]:
+            far = change is not None and not 1.0 / _FAR_FACTOR <= change <= _FAR_FACTOR
+            limit = f"a factor of {_FAR_FACTOR:g}"
+        else:
+            far = change is not None and abs(change) > _FAR_SIGMAS
+            limit = f"{_FAR_SIGMAS:g} deviations of its prior"
+        if far:
+            yield (
+                f"{called(number)} moved by more than {limit} ({number['moved']}): check its start, and"
+                " whether the model fits these recordings"
+            )
+
+
+def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
+    for number in record["numbers"]:
+        bounds, value = number["bounds"], number["tuned"]
+        if bounds is None or value is None:
+            continue
+        for bound, which in zip(bounds, ("lower", "upper"), strict=True):
+            # Of what may range over decades 1 % of the bound, else 1 % of what lies between both.
+            reach = abs(bound) if number["logarithm"] else bounds[1] - bounds[0]
+            if abs(value - bound) <= _NEAR_BOUND * reach:
+                yield (
+                    f"{called(number)} is at its {which} bound ({bound:.5g} {number['unit']}): the data"
+                    " ask for more; widen the bounds, or look for what makes it go there"
+                )
+
+
+def _scaled(record: Mapping[str, Any]) -> Iterable[str]:
+    factor = record["covariance_scale"]
+    past = []
+    for number in record["numbers"]:
+        bounds, value = number["bounds"], number["written"]
+        if bounds is None or value is None:
+            continue
+        if not bounds[0] <= value <= bounds[1] and bounds[0] <= number["tuned"] <= bounds[1]:
+            past.append(called(number))
+    if past:
+        yield (
+            f"The common scale of all covariances ({factor:.4g}) took {_listed(past)} past the bounds:"
+            " widen them, or tune by likelihood, which needs no such scale"
+        )
+    if also := record.get("also_scaled"):
+        yield (
+            f"The common scale of all covariances ({factor:.4g}) also holds for {_listed(also)}, not free"
+            " in this tuning: without it the estimate would change; tune by likelihood to keep them"
+        )
+
+
+def _worse(record: Mapping[str, Any]) -> Iterable[str]:
+    for rows, where in _judged(record):
+        for name in record["errors"] or ["attitude"]:
+            column, head, unit = _COLUMNS[name]
+            for run, first, last in _pairs(rows, column):
+                if last > _WORSE * first:
+                    more = 100.0 * (last / first - 1.0) if first else math.inf
+                    yield (
+                        f"{run} ({where}) got worse: its {head} is {last:.4g} {unit}, {more:.3g} % more"
+                        f" than the {first:.4g} {unit} of the start"
+                    )
+
+
+def _honest(record: Mapping[str, Any]) -> Iterable[str]:
+    low, high = HONEST_NEES
+    for rows, where in _judged(record):
+        if where == "training":
+            continue
+        told = [
+            f"{row['run']}: {row['nees']:.3g}"
+            for row in rows
+            if row["variant"] == "tuned"
+            and row["nees"] is not None
+            and not low <= row["nees"] <= high
+        ]
+        if told:
+            yield (
+                f"The attitude's NEES after tuning is outside {low:g} to {high:g} in {_listed(told)}"
+                f" ({where}): there the covariance is not that of the error"
+            )
+
+
+def _judged(record: Mapping[str, Any]) -> Iterable[tuple[Sequence[Mapping[str, Any]], str]]:
+    """Rows, and whether their runs were held out or learnt from."""
+    yield record["rows"], "training" if record["judged_on"] == "training runs" else "held out"
+    if record["folds"]:
+        yield record["folds"]["rows"], "held out by its fold"
+
+
+def _pairs(rows: Sequence[Mapping[str, Any]], column: str) -> Iterable[tuple[str, float, float]]:
+    """Run and a number of it before and after tuning, where both are known."""
+    first_of = before(rows)
+    found = {(row["run"], row["variant"]): row[column] for row in rows}
+    for run in dict.fromkeys(row["run"] for row in rows):
+        first, last = found.get((run, first_of)), found.get((run, "tuned"))
+        if first is not None and last is not None:
+            yield run, first, last
+
+
+def called(number: Mapping[str, Any]) -> str:
+    """A free number by its name, and the run it belongs to."""
+    return number["name"] + (f" of {number['run']}" if number["run"] else "")
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_MOST_NAMED])
+    left = len(names) - _MOST_NAMED
+    return f"{shown} and {left} more" if left > 0 else shown

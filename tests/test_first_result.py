@@ -18,7 +18,7 @@ from scipy import stats
 
 import jaxekf
 import tuning
-from jaxekf._support import chi_square, program_cache
+from jaxekf._support import chi_square, deprecations, program_cache
 from jaxekf.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -106,16 +106,35 @@ def test_star_import_and_submodules_work_in_a_new_process():
     code = (
         "import json, jaxekf\nfrom jaxekf import *\nfrom jaxekf.cli import estimate\n"
         "import jaxekf.models.robust\n"
-        "print(json.dumps([callable(robust), callable(jaxekf.robust), demo.__name__, rotation.__name__,"
+        "print(json.dumps([callable(robust), callable(jaxekf.robust), demo.__name__, timeline.__name__,"
         " jaxekf.io.run_folder.__name__]))"
     )
     assert run_python(code) == [
         True,
         True,
         "jaxekf.simulation.demo",
-        "jaxekf.geometry.rotation",
+        "jaxekf.estimation.timeline",
         "jaxekf.io.run_folder",
     ]
+
+
+def test_old_names_are_found_for_one_release():
+    """Would catch a moved module that breaks a user's script, is loaded twice, or comes without a warning."""
+    for old, new in deprecations.MOVED.items():
+        with pytest.warns(DeprecationWarning, match="will be gone in the next release"):
+            module = import_module(old)
+        assert module is import_module(new) and module.__spec__.name == new
+    with pytest.warns(DeprecationWarning, match=r"jaxekf\.geometry\.triad"):
+        assert jaxekf._support.deprecations.moved("jaxekf.vectors", 1) is jaxekf.geometry.triad
+    code = (
+        "import warnings; warnings.simplefilter('ignore')\nimport json, jaxekf\n"
+        "from jaxekf import rotation, storage\nfrom jaxekf.datasets import demo\n"
+        "from jaxekf.description import facts\nfrom jaxekf.estimation import estimate\n"
+        "from tuning.fit import tune\n"
+        "print(json.dumps([rotation.__name__, storage.load is jaxekf.load, demo is jaxekf.demo,"
+        " facts({}, ''), callable(estimate), callable(tune)]))"
+    )
+    assert run_python(code) == ["jaxekf.geometry.rotation", True, True, {}, True, True]
 
 
 def test_every_listed_command_is_there():
@@ -165,7 +184,7 @@ early = counts()["compiled"]
 place = jaxekf.keep_programs(sys.argv[1])
 sys.path.insert(0, sys.argv[3])
 import toy_models
-from jaxekf.timeline import Rows, Steps
+from jaxekf import Rows, Steps
 
 one = np.eye(2)
 model = toy_models.linear_model(one, 0.1 * one, [one], [0.2 * one])
@@ -282,7 +301,7 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 import jaxekf
-from jaxekf.datasets import demo
+from jaxekf.simulation import demo
 from tuning.data import prepare
 from tuning.descent import total_counts
 from tuning.objectives import attitude_error, innovation_likelihood

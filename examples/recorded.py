@@ -4,11 +4,9 @@ import argparse
 import json
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from jaxekf.recordings.types import NANOSECONDS, STREAMS, Recording
+from jaxekf.recordings.types import NANOSECONDS, Recording
 
 DATA = Path(os.environ.get("JAXEKF_DATA", Path(__file__).parents[2] / "shared" / "data"))
 """The folder that `--smoke` looks for data in."""
@@ -43,12 +41,8 @@ def piece(recording: Recording, start_s: float, seconds: float) -> Recording:
     """The recording from `start_s` after its IMU's first sample, `seconds` long."""
     begin = int(recording.need_imu().time_ns[0]) + int(start_s * NANOSECONDS)
     end = begin + int(seconds * NANOSECONDS)
-    found: dict[str, Any] = {}
-    for label in STREAMS:
-        stream = getattr(recording, label)
-        if stream is None:
-            continue
-        kept = (stream.time_ns >= begin) & (stream.time_ns < end)
-        values = {name: getattr(stream, name) for name in ("time_ns", *stream.per_sample)}
-        found[label] = replace(stream, **{k: v[kept] for k, v in values.items() if v is not None})
-    return recording.replace(**found)
+    streams = {
+        label: stream.take((stream.time_ns >= begin) & (stream.time_ns < end))
+        for label, stream in recording.streams.items()
+    }
+    return recording.with_streams(streams)

@@ -67,14 +67,16 @@ def imports(file):
 
 def room_of(module):
     """The room of a module, '' for `jaxekf` and `tuning` themselves and for ``python -m jaxekf``."""
-    room = (module.split(".") + [""])[1]
+    room = [*module.split("."), ""][1]
     return "" if room == "__main__" else room
 
 
 def test_the_house_has_these_rooms():
     """Would catch a file in the hall, and a room that no rule knows."""
     for top, rooms in ROOMS.items():
-        there = {p.name.removesuffix(".py") for p in (ROOT / top).iterdir() if p.name != "__pycache__"}
+        there = {
+            p.name.removesuffix(".py") for p in (ROOT / top).iterdir() if p.name != "__pycache__"
+        }
         assert there - {"__init__", "__main__", "py.typed"} == set(rooms)
     assert len(ROOMS["jaxekf"]) <= 14
 
@@ -110,7 +112,8 @@ def test_private_modules_stay_in_their_room(file):
 
 
 def test_no_module_imports_itself_in_a_circle():
-    """Would catch two modules that can only be understood together, also where ``TYPE_CHECKING`` hides it."""
+    """Would catch two modules that can only be understood together, also where ``TYPE_CHECKING`` hides
+    it."""
     known = {module_name(file): {m for m in imports(file) if m in MODULES} for file in FILES}
     for package in ROOMS:
         known.pop(package)
@@ -118,7 +121,8 @@ def test_no_module_imports_itself_in_a_circle():
 
 
 def test_rooms_say_what_they_hold():
-    """Would catch a room that a newcomer has to guess at, and a file that is too long to be read at once."""
+    """Would catch a room that a newcomer has to guess at, and a file that is too long to be read at
+    once."""
     for file in FILES:
         text = file.read_text()
         assert len(text.splitlines()) <= 450, file

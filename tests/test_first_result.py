@@ -119,7 +119,8 @@ def test_star_import_and_submodules_work_in_a_new_process():
 
 
 def test_old_names_are_found_for_one_release():
-    """Would catch a moved module that breaks a user's script, is loaded twice, or comes without a warning."""
+    """Would catch a moved module that breaks a user's script, is loaded twice, or comes without a
+    warning."""
     for old, new in deprecations.MOVED.items():
         with pytest.warns(DeprecationWarning, match="will be gone in the next release"):
             module = import_module(old)

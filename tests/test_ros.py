@@ -10,8 +10,8 @@ import pytest
 
 import jaxekf
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _encoder as encoder
 from jaxekf.io.importers import ros
+from jaxekf.io.streams import encoder
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Place
 from jaxekf.recordings.types import to_scipy

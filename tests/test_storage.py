@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 import jaxekf
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _encoder as encoder_storage
 from jaxekf.io import atomic, csv_table, run_folder
 from jaxekf.io.description import Source
+from jaxekf.io.streams import encoder as encoder_storage
 from jaxekf.recordings.types import Encoder, Imu, Optical, Recording
 from jaxekf.simulation import attitude_runs
 
@@ -93,7 +93,7 @@ def test_encoder_frames_and_sides(tmp_path):
         }
         (tmp_path / "encoder.csv").write_text("time,angle\n0,0.7\n")
         table = csv_table.read_table(tmp_path / "encoder.csv")
-        stream, _ = encoder_storage.read(table, Source(about, tmp_path, sort=False))
+        stream, _ = encoder_storage.SCHEMA.read_table(table, Source(about, tmp_path, sort=False))
         return Rotation.from_quat(np.roll(stream.q_ref_body[0], -1))
 
     for side, expected in (("reference", frame * turn * zero), ("body", frame * zero * turn)):

@@ -41,11 +41,11 @@ _ROOMS = {
         "unscented vectors>triad wahba"
     ),
     "jaxekf.io": (
-        "camera_storage>_camera container_files>_container_arrays "
+        "camera_storage>streams.camera container_files>_container_arrays "
         "container_guard>_container_integrity container_layout>_container_schema "
-        "container_streams>_container_streams containers>container datasets>importers "
-        "description encoder_storage>_encoder export files>atomic frame_lines>_frame_rows "
-        "hashes marker_storage>_markers stated>_stream_options storage>run_folder "
+        "container_streams>streams containers>container datasets>importers "
+        "description encoder_storage>streams.encoder export files>atomic frame_lines>_frame_rows "
+        "hashes marker_storage>streams.markers stated>_stream_options storage>run_folder "
         "tables>csv_table temporary>_temporary text>_csv_text"
     ),
     "jaxekf.io.importers": (

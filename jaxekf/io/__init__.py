@@ -1,12 +1,16 @@
 """Files: recorded runs as folders and as single files, exports, and readers of other programs' files.
 
-`load` and `save` are public, as are `read_export` and `importers`. A new format of other programs goes into
-`importers`; a new stream is one file in this room with its `StreamSchema`.
+`load`, `save`, `register`, `read_export`, `schema` and `importers` are public. A new format of another
+program goes into `importers`; a new stream is one file in `streams`, with its `StreamSchema`.
 """
 
 from jaxekf._support.lazy import attributes
 
 __getattr__, __dir__ = attributes(
     __name__,
-    {"jaxekf.io.run_folder": ("load", "load_imu", "save"), "jaxekf.io.export": ("read_export",)},
+    {
+        "jaxekf.io.export": ("read_export",),
+        "jaxekf.io.run_folder": ("load", "load_imu", "save"),
+        "jaxekf.io.streams": ("register",),
+    },
 )

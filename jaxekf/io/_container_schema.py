@@ -1,101 +1,24 @@
-"""A recorded run in one file: which data sets it has, of which type, shape, unit and frame."""
+"""Types, shapes, units and frames of the data sets in a run's HDF5 or NPZ file, against its schemas."""
 
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.recordings.facts import BODY_TO_REFERENCE
+from jaxekf.io.schema import COUNT, FLAG, TEXT, TIME, Field
 
 KIND = "jaxekf run"
-"""What `kind` says at the root."""
-TIME, COUNT, NUMBER, FLAG, TEXT = "time", "count", "number", "flag", "text"
+"""Attribute `kind` of the root."""
 _LARGEST_EXACT = 2**53
 """Integers up to here are float64 without loss."""
 
 
-class Field(NamedTuple):
-    """One data set of a stream."""
-
-    kind: str
-    shape: tuple[str | int, ...] = ()
-    """N samples, M markers, L landmarks."""
-    unit: str = ""
-    frame: str = ""
-    needed: bool = False
-
-    @property
-    def described(self) -> dict[str, str]:
-        """Its attributes."""
-        about = {"unit": self.unit, "frame": self.frame}
-        return {key: text for key, text in about.items() if text}
-
-
-_TIMES = Field(TIME, ("N",), "ns", needed=True)
-_LATENCY = Field(COUNT, (), "ns")
-_ATTITUDE = Field(NUMBER, ("N", 4), "1", BODY_TO_REFERENCE, needed=True)
-_POSITION = Field(NUMBER, ("N", 3), "m", "reference")
-_FLAGS = Field(FLAG, ("N",), "1")
-
-LAYOUT: Mapping[str, Mapping[str, Field]] = {
-    "optical": {
-        "time_ns": _TIMES,
-        "q_ref_body": _ATTITUDE,
-        "valid": _FLAGS,
-        "position": _POSITION,
-        "error": Field(NUMBER, ("N",), "m"),
-        "p_body_tool": Field(NUMBER, (3,), "m", "body"),
-        "latency_ns": _LATENCY,
-    },
-    "markers": {
-        "time_ns": _TIMES,
-        "names": Field(TEXT, ("M",), needed=True),
-        "position": Field(NUMBER, ("N", "M", 3), "m", "reference", needed=True),
-        "visible": Field(FLAG, ("N", "M"), "1"),
-        "p_body_marker": Field(NUMBER, ("M", 3), "m", "body", needed=True),
-        "quality": Field(NUMBER, ("N", "M")),
-        "quality_min": Field(NUMBER),
-        "error": Field(NUMBER, ("N", "M"), "m"),
-        "latency_ns": _LATENCY,
-    },
-    "camera": {
-        "time_ns": _TIMES,
-        "names": Field(TEXT, ("L",), needed=True),
-        "pixel": Field(NUMBER, ("N", "L", 2), "px", "image, u to the right, v down", needed=True),
-        "visible": Field(FLAG, ("N", "L"), "1"),
-        "p_ref_landmark": Field(NUMBER, ("L", 3), "m", "reference", needed=True),
-        "focal": Field(NUMBER, (2,), "px", needed=True),
-        "centre": Field(NUMBER, (2,), "px", needed=True),
-        "radial": Field(NUMBER, (2,), "1"),
-        "p_body_camera": Field(NUMBER, (3,), "m", "body"),
-        "q_body_camera": Field(NUMBER, (4,), "1", "w,x,y,z, camera to body"),
-        "sigma": Field(NUMBER, ("N", "L"), "px"),
-        "latency_ns": _LATENCY,
-    },
-    "imu": {
-        "time_ns": _TIMES,
-        "gyroscope": Field(NUMBER, ("N", 3), "rad/s", "body", needed=True),
-        "accelerometer": Field(NUMBER, ("N", 3), "m/s^2", "body"),
-        "magnetometer": Field(NUMBER, ("N", 3), "", "body"),
-    },
-    "encoder": {
-        "time_ns": _TIMES,
-        "q_ref_body": _ATTITUDE,
-        "valid": _FLAGS,
-        "scored": _FLAGS,
-        "position": _POSITION,
-    },
-}
-"""Streams and their data sets, the same paths in HDF5 and NPZ."""
-
-
-def check_names(place: str, label: str, names: set[str]) -> None:
+def check_names(place: str, label: str, names: set[str], fields: Mapping[str, Field]) -> None:
     """A group holds the data sets that it must, and none that is not known."""
-    fields = LAYOUT[label]
     missing = [key for key, field in fields.items() if field.needed and key not in names]
     unknown = sorted(names - set(fields))
     if missing or unknown:

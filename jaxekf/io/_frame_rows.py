@@ -6,14 +6,14 @@ The lines of a frame share exactly one time and stand together.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.io.csv_table import Table, stamps, words
 from jaxekf.recordings import screening
-from jaxekf.recordings.accounts import Indices, Intake, Part
+from jaxekf.recordings.accounts import Indices, Intake, Part, Place
 from jaxekf.recordings.types import Flags, Floats, Times
 
 
@@ -108,3 +108,37 @@ def bad_name(names: Sequence[str]) -> int | None:
             return i
         seen.add(name)
     return None
+
+
+def check_names(place: Place, names: Sequence[str], part: str) -> None:
+    """Raise `RecordingError` unless each part has a name of its own, as a CSV file can hold, and one
+    exists."""
+    bad = bad_name(names)
+    if bad is not None:
+        raise place.error(bad, "names", repr(names[bad]), NAMES, f"renaming the {part}")
+    if not names:
+        raise place.error(None, None, f"no {part}", "at least one", "giving its name and position")
+
+
+def dense_frames(
+    place: Place,
+    time_ns: Times,
+    rows: Sequence[Any],
+    names: tuple[str, ...],
+    sort: bool,
+    slowest_s: float = screening.SLOWEST_S,
+) -> tuple[Times, Indices, Intake]:
+    """Frames that hold every part: their times, their indices in order of time, and the account, in which
+    each part of each frame is a row."""
+    order, account = screening.in_order(place, time_ns, rows, sort=sort)
+    screening.check_rate(place, time_ns[order], slowest_s)
+    count = len(names)
+    repeated = {
+        reason: replace(r, numbers=np.repeat(r.numbers, count), time_ns=np.repeat(r.time_ns, count))
+        for reason, r in account.dropped.items()
+    }
+    again = [r.time_ns for r in account.dropped.values()]
+    none = time_ns[:0]
+    parts = {name: Part(len(time_ns), np.concatenate([*again, none]), none) for name in names}
+    account = replace(account, rows=len(time_ns) * count, dropped=repeated, parts=parts)
+    return time_ns[order], order, account

@@ -1,16 +1,6 @@
-"""What a section of `recording.toml` states of a stream's file: its columns, units and frames.
+"""Entries that the section of every stream in `recording.toml` may have: its file, columns and units."""
 
-``file``        name of the CSV file in the run's folder
-``columns``     our names of columns and the file's, ``{ time = "Time [ms]", qw = "Rot W" }``; or, of a file
-                without a header, a list of our names in their order, "" for what is not read
-``skip_lines``  lines before the header
-``delimiter``   ",", ";" or a tab, where the header does not tell
-``time_unit``   "s", "ms", "us" or "ns"
-``unit``        of the numbers, such as "deg/s, g" or "1, mm"
-``quaternion``  order and direction, such as "x,y,z,w, body to reference"
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,75 +11,47 @@ from jaxekf._support.errors import RecordingError
 from jaxekf.io._csv_text import DELIMITERS
 from jaxekf.io.csv_table import QUATERNION, TIME_UNITS, Layout
 from jaxekf.recordings.facts import BODY_TO_REFERENCE, FILE
-from jaxekf.recordings.types import STREAMS, Floats
+from jaxekf.recordings.types import Floats
 
-RUN_KEYS = (
-    *STREAMS,
-    "schema_version",
-    "name",
-    "sha256",
-    "trust_units",
-    "gravity_ref",
-    "field_ref",
-    "p_body_object",
-    "q_body_object",
-)
-SECTION_KEYS = (
-    "kind",
-    "frame",
-    "unit",
-    "quaternion",
-    "file",
-    "columns",
-    "skip_lines",
-    "delimiter",
-    "time_unit",
-    "latency",
-    "status_ok",
-    "error_max",
-    "p_body_tool",
-    "quality_min",
-    "geometry",
-    "focal",
-    "centre",
-    "radial",
-    "p_body_camera",
-    "q_body_camera",
-    "axis",
-    "acts_on",
-    "q_zero",
-    "q_optical_encoder",
-    "p_optical_encoder",
-)
-HELD = ("file", "columns", "skip_lines", "delimiter", "time_unit")
-"""Entries that are of no more use once a file is read."""
-_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_RATE = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
-_FORCE = {"m/s^2": 1.0, "g": 9.80665, "mm/s^2": 1e-3}
-_ANGLE = {"rad": 1.0, "deg": np.pi / 180.0}
-_ONE = {"1": 1.0}
-_PIXEL = {"px": 1.0}
-_UNITS: dict[str, tuple[dict[str, float], ...]] = {
-    "imu": (_RATE, _FORCE),
-    "optical": (_ONE, _LENGTH),
-    "markers": (_LENGTH,),
-    "camera": (_LENGTH, _PIXEL),
-    "joint": (_ANGLE,),
-    "encoder": (_ONE, _LENGTH),
+COMMON = {
+    "kind": "kind of the stream, checked where it is stated",
+    "frame": "frame of the numbers, checked where it is stated",
+    "unit": 'units of the numbers in the order of the columns, such as "deg/s, g" (default: SI)',
+    "quaternion": f'order and direction (default "{BODY_TO_REFERENCE}")',
+    "file": "name of the CSV file in the run's folder (default: the stream's name)",
+    "columns": 'our names of columns and the file\'s, `{ time = "Time [ms]" }`; for a file without a'
+    ' header a list of our names in their order, "" for a column that is not read',
+    "skip_lines": "number of lines before the header (default 0)",
+    "delimiter": 'one of "," ";" and tab (default: as the header shows)',
+    "time_unit": 'unit of the times: "s", "ms", "us" or "ns" (default "s")',
 }
+"""Entries of every stream's section, and what they mean."""
+OF_THE_FILE = ("file", "columns", "skip_lines", "delimiter", "time_unit")
+"""Entries that are of no more use once a file is read."""
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0},
+    "m/s^2": {"m/s^2": 1.0, "g": 9.80665, "mm/s^2": 1e-3},
+    "rad": {"rad": 1.0, "deg": np.pi / 180.0},
+    "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "N m": {"N m": 1.0, "N mm": 1e-3},
+    "Pa": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "bar": 1e5},
+}
+"""Units that a file may have, and their size in the SI unit; any other SI unit is only itself."""
 _DIRECTIONS = ("body to reference", "reference to body")
 
 
 class Turning(NamedTuple):
-    """How a quaternion's four numbers stand."""
+    """Order and direction of a quaternion's four numbers."""
 
     order: tuple[str, ...]
     inverse: bool
 
     def columns(self, columns: Sequence[str]) -> tuple[str, ...]:
-        """Which of the columns qw, qx, qy, qz, as they stand in a file, hold w, x, y and z.
+        """Columns of a file that hold w, x, y and z.
 
-        Their names say so, unless an order is stated that is neither the usual one nor theirs.
+        These are qw, qx, qy, qz, unless an order is stated that is neither the usual one nor that of the
+        columns in the file.
         """
         there = [name for name in columns if name in QUATERNION]
         if self.order == tuple("wxyz") or [f"q{axis}" for axis in self.order] == there:
@@ -101,11 +63,13 @@ class Turning(NamedTuple):
         return values * np.array([1.0, -1.0, -1.0, -1.0]) if self.inverse else values
 
 
-def check_keys(entries: Mapping[str, Any], label: str, place: Path | str) -> None:
-    """Raise `RecordingError` for an entry that is nearly one that means something; others are facts."""
-    known = SECTION_KEYS if label else RUN_KEYS
+def check_keys(
+    entries: Mapping[str, Any], label: str, place: Path | str, known: Iterable[str]
+) -> None:
+    """Raise `RecordingError` for an entry that is nearly one of those `known`; others are facts."""
+    names = list(known)
     for key in entries:
-        near = [] if key in known else get_close_matches(key, known, 1, 0.8)
+        near = [] if key in names else get_close_matches(key, names, 1, 0.8)
         if near:
             head = f"{label}." if label else ""
             raise RecordingError(
@@ -118,7 +82,7 @@ def check_keys(entries: Mapping[str, Any], label: str, place: Path | str) -> Non
 
 
 def layout(label: str, about: Mapping[str, Any], place: Path | str) -> Layout:
-    """Where a stream's numbers are. Raises `RecordingError` for an entry that says nothing."""
+    """Layout of a stream's file. Raises `RecordingError` for an entry of another form."""
 
     def stated(key: str, kind: type, expected: str, default: Any) -> Any:
         value = about.get(key, default)
@@ -156,19 +120,21 @@ def _is_renaming(columns: Any) -> bool:
     )
 
 
-def factors(label: str, about: Mapping[str, Any], place: Path | str) -> tuple[float, ...]:
-    """What each of a stream's units, ``unit = "deg/s, g"``, is in SI; those that are not stated are."""
-    known = _UNITS[label]
-    section = "encoder" if label == "joint" else label
+def factors(
+    label: str, units: Sequence[str], about: Mapping[str, Any], place: Path | str
+) -> tuple[float, ...]:
+    """Size of each stated unit, ``unit = "deg/s, g"``, in the SI `units` of a stream; 1 where none is
+    stated."""
+    known = [UNITS.get(unit, {unit: 1.0}) for unit in units]
     value = about.get("unit")
     parts = [part.strip() for part in value.split(",")] if isinstance(value, str) else []
-    good = all(part in units for part, units in zip(parts, known, strict=False))
-    # What is beyond, such as a magnetometer's, is not used.
+    good = all(part in choices for part, choices in zip(parts, known, strict=False))
+    # Further units, such as a magnetometer's, are not used.
     if value is not None and (not parts or not good):
-        expected = ", then ".join(" or ".join(units) for units in known)
-        raise _wrong(place, section, "unit", value, expected)
-    told = [units[part] for part, units in zip(parts, known, strict=False)]
-    return (*told, *[1.0] * (len(known) - len(told)))
+        expected = ", then ".join(" or ".join(choices) for choices in known)
+        raise _wrong(place, label, "unit", value, expected)
+    stated = [choices[part] for part, choices in zip(parts, known, strict=False)]
+    return (*stated, *[1.0] * (len(known) - len(stated)))
 
 
 def scaled(values: Floats, factor: float) -> Floats:

@@ -1,12 +1,12 @@
 """A recorded run as one HDF5 or NPZ file: the same paths in both, to the last bit.
 
-The root says ``kind``, ``schema_version``, ``name``, ``info`` (TOML text) and ``sha256`` (of all values);
-the groups ``optical``, ``markers``, ``camera``, ``imu`` and ``encoder`` hold a stream each. What is said of
-a data set (``unit``, ``frame``) is an attribute in HDF5, and an entry ``optical/time_ns@unit`` in NPZ.
-`container_layout` has the list of data sets, `container_files` reads them.
+The root has the attributes ``kind``, ``schema_version``, ``name``, ``info`` (TOML text) and ``sha256``
+(of all values). Each stream is a group of its name; its data sets are the fields of its schema
+(`jaxekf.io.streams`).
+``unit`` and ``frame`` of a data set are attributes in HDF5, and entries ``optical/time_ns@unit`` in NPZ.
 
-Whoever writes such a file without ``sha256`` (any program that writes HDF5) has its rows judged like those
-of a CSV file; all that is at the root may be missing then.
+In a file without ``sha256``, which any program may write, rows are screened like those of a CSV file. All
+attributes of the root may then be missing.
 """
 
 import tomllib
@@ -20,12 +20,13 @@ import tomli_w
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _container_schema as layout
-from jaxekf.io import _container_streams as container_streams
 from jaxekf.io import export
 from jaxekf.io._container_arrays import SUFFIXES, of_fixed_length, open_container
 from jaxekf.io.atomic import whole_file
 from jaxekf.io.description import SCHEMA_VERSION
-from jaxekf.recordings import facts
+from jaxekf.io.schema import TEXT, Field
+from jaxekf.io.streams import SCHEMAS
+from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.frozen_poses import without_repeats
 from jaxekf.recordings.types import STREAMS, Recording
@@ -72,22 +73,22 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
 def load(path: Path | str, *, sort: bool = False) -> Recording:
     """Read a run from an HDF5 or NPZ file that `save`, or another program, wrote.
 
-    Of the data sets in `container_layout.LAYOUT` those that are needed must be there, and no unknown ones;
-    other groups are not read. A type is read where no value changes by it: float32, small integers, any
-    integer times that fit, never times as floats. Where ``sha256`` is there it has to be that of the
-    content, which then is taken as it is: only rows that ``valid`` (or ``visible``) says are hidden are
-    masked, and what is not finite. Without it rows are judged as those of a CSV file are (`intake`), and
-    with `sort` put in order of time. `Recording.intake` has the account. Raises `RecordingError`.
+    The data sets that a schema needs must be there, and no unknown ones; other groups are not read. A
+    type is read where no value changes by it: float32, small integers, any integer times that fit,
+    never times as floats. Where ``sha256`` is there it has to be that of the content, which then is
+    taken as it is: only rows that ``valid`` (or ``visible``) says are hidden are masked, and what is
+    not finite. Without it rows are judged as those of a CSV file are (`intake`), and with `sort` put in
+    order of time. `Recording.intake` has the account. Raises `RecordingError`.
     """
     path = _known(path)
     data: dict[str, Any] = {}
-    with open_container(path, STREAMS, _ROOT) as content:
+    with open_container(path, tuple(SCHEMAS), _ROOT) as content:
         said = {key: content.said[key] for key in _ROOT if key in content.said}
         _check_root(path, said)
-        for label in STREAMS:
+        for label, schema in SCHEMAS.items():
             names = {k.split("/", 1)[1] for k in content.arrays if k.startswith(f"{label}/")}
             if names:
-                layout.check_names(str(path), label, names)
+                layout.check_names(str(path), label, names, schema.stored)
         _check_declared(path, content.arrays, content.said)
         for key, stored in content.arrays.items():
             data[key] = layout.exact(str(path), key, stored.read(), _field(key))
@@ -113,9 +114,9 @@ def _known(path: Path | str) -> Path:
     return Path(path)
 
 
-def _field(key: str) -> layout.Field:
+def _field(key: str) -> Field:
     label, name = key.split("/", 1)
-    return layout.LAYOUT[label][name]
+    return SCHEMAS[label].fields[name]
 
 
 def _check_root(path: Path, said: Mapping[str, Any]) -> None:
@@ -131,10 +132,10 @@ def _check_root(path: Path, said: Mapping[str, Any]) -> None:
 
 def _check_declared(path: Path, arrays: Mapping[str, Any], said: Mapping[str, Any]) -> None:
     """Types, shapes, units and frames are as documented, before any of it is read."""
-    for label in STREAMS:
+    for label, schema in SCHEMAS.items():
         sizes: dict[str, int] = {}
-        # Times and names first: they say how many samples, markers and landmarks there are.
-        keys = [f"{label}/{name}" for name in layout.LAYOUT[label]]
+        # Times and names first: they have as many entries as there are samples, markers and landmarks.
+        keys = [f"{label}/{name}" for name in schema.stored]
         for key in (key for key in keys if key in arrays):
             field, stored = _field(key), arrays[key]
             layout.check_type(str(path), key, stored.dtype, field)
@@ -149,21 +150,43 @@ def _assemble(
     """A run of arrays in their types, its rows judged."""
     streams: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
-    for label, make in container_streams.MAKERS.items():
+    for label, schema in SCHEMAS.items():
         group = {k.split("/", 1)[1]: v for k, v in data.items() if k.startswith(f"{label}/")}
         if group:
-            stream, account = make(Place(f"{path}:{label}"), group, sort)
+            stream, account = schema.make(Place(f"{path}:{label}"), group, sort)
             if own:
-                stream = container_streams.as_stored(stream, group)
+                stream = _as_stored(stream, group)
             streams[label], accounts[label] = stream, account
     if not streams:
         raise RecordingError(
             path, "no stream", f"one of the groups {', '.join(STREAMS)}", "another file"
         )
     info = _info(path, said.get("info", ""))
-    return Recording(
-        str(said.get("name", path.stem)), **streams, info=info, path=path, intake=accounts
-    )
+    made = Recording(str(said.get("name", path.stem)), info=info, path=path, intake=accounts)
+    return made.with_streams(streams)
+
+
+def _as_stored(stream: Any, group: Mapping[str, Any]) -> Any:
+    """The stream with the numbers that `save` wrote, where screening has scaled or replaced them.
+
+    A pose that was screened when the run was first read keeps its last bits.
+    """
+    if len(stream.time_ns) != len(group["time_ns"]):
+        return stream
+    kept: dict[str, Any] = {}
+    if "q_ref_body" in group:
+        stored = group["q_ref_body"]
+        with np.errstate(invalid="ignore", over="ignore"):
+            near = np.abs(np.linalg.norm(stored, axis=1) - 1.0) <= screening.NORM_ROUNDED
+        as_it_is = near | ~group["valid"] if "valid" in group else near
+        kept["q_ref_body"] = np.where(as_it_is[:, None], stored, stream.q_ref_body)
+    if "q_body_camera" in group:
+        stored = group["q_body_camera"]
+        if abs(np.linalg.norm(stored) - 1.0) <= screening.NORM_ROUNDED:
+            kept["q_body_camera"] = stored
+    if "scored" in group:
+        kept["scored"] = group["scored"]
+    return replace(stream, **kept)
 
 
 def _info(path: Path, text: str) -> dict[str, Any]:
@@ -213,13 +236,13 @@ def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
             "a folder, which has room for more",
         )
     entries: dict[str, export.Entry] = {}
-    for label in STREAMS:
-        stream = getattr(recording, label)
-        for name, field in layout.LAYOUT[label].items() if stream is not None else ():
-            value = getattr(stream, name)
+    for label, stream in recording.streams.items():
+        schema = SCHEMAS[label]
+        for name, field in schema.stored.items():
+            value = schema.value(stream, name)
             if value is not None:
                 key = f"{label}/{name}"
-                raw = np.array(value, object if field.kind == layout.TEXT else None)
+                raw = np.array(value, object if field.kind == TEXT else None)
                 layout.check_type(str(path), key, raw.dtype, field)
                 entries[key] = export.Entry(
                     layout.exact(str(path), key, raw, field), field.described

@@ -4,9 +4,9 @@ import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxekf.io.description import LANDMARKS
+from jaxekf.io.streams import SCHEMAS
 from jaxekf.recordings.facts import FILE
-from jaxekf.recordings.types import STREAMS, Recording
+from jaxekf.recordings.types import Recording
 
 _READ = (".csv", ".json", ".toml", ".txt", ".yaml", ".yml")
 """Suffixes that readers of other layouts look at; a folder of camera images is not worth its hours."""
@@ -23,8 +23,8 @@ def hashed(folder_or_file: Path | str) -> dict[str, str]:
     if not path.is_dir():
         files = [path]
     elif (path / FILE).is_file():
-        names = (FILE, *(f"{label}.csv" for label in STREAMS), LANDMARKS)
-        files = [path / name for name in names]
+        beside = (name for schema in SCHEMAS.values() for name in schema.beside)
+        files = [path / name for name in (FILE, *(f"{label}.csv" for label in SCHEMAS), *beside)]
     else:
         files = [file for file in path.rglob("*") if file.suffix.lower() in _READ]
     found = {}

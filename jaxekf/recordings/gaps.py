@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf.recordings.accounts import Intake, Part, Reason
-from jaxekf.recordings.types import NANOSECONDS, STREAMS, Flags, Recording, Times, period_ns
+from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times, period_ns
 
 LONGEST_INPUT_GAP_S = 0.1
 """An input is interpolated over shorter gaps; over longer ones the motion is not known."""
@@ -79,27 +79,18 @@ def _part(recording: Recording, begin: int, end: int) -> Recording:
     """What was taken from one time to another, the latter not included."""
     streams: dict[str, Any] = {}
     intake: dict[str, Intake] = {}
-    for label in STREAMS:
-        stream = getattr(recording, label)
-        if stream is None:
-            continue
-        late = getattr(stream, "latency_ns", 0)
+    for label, stream in recording.streams.items():
+        late = stream.latency_ns
 
         def inside(stamps: Times, late: int = late) -> Flags:
             return (stamps - late >= begin) & (stamps - late < end)
 
         rows = inside(stream.time_ns)
-        streams[label] = None
-        if rows.any():
-            kept = {
-                key: None if getattr(stream, key) is None else getattr(stream, key)[rows]
-                for key in ("time_ns", *stream.per_sample)
-            }
-            streams[label] = replace(stream, **kept)
+        streams[label] = stream.take(rows) if rows.any() else None
         account = recording.intake.get(label)
         if account is not None:
             intake[label] = _account_of(account, rows, inside)
-    return recording.replace(**streams, intake=intake)
+    return recording.with_streams(streams, intake=intake)
 
 
 def _account_of(account: Intake, rows: Flags, inside: Any) -> Intake:

@@ -331,6 +331,19 @@ def need_usable(place: Place, valid: Flags, account: Intake, what: str, hint: st
         raise place.error(None, None, got, "at least one", hint)
 
 
+def check_reported(
+    place: Place, column: str, values: Floats | None, least: float = -np.inf
+) -> Floats | None:
+    """Figures (N, ...) that a sensor reports, unchanged. Raises `RecordingError` unless each is finite and
+    not below `least`, or NaN where none was reported."""
+    if values is not None and (bad := np.argwhere(np.isinf(values) | (values < least))).size:
+        at = tuple(bad[0])
+        expected = "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more"
+        hint = "writing NaN, which means that none was reported"
+        raise place.error(int(at[0]), column, f"{values[at]}", expected, hint)
+    return values
+
+
 def chosen(values: NDArray[Any], rows: Indices) -> NDArray[Any]:
     """Some rows of values (N, ...); the values themselves, no copy, where that is all of them in order."""
     every = len(rows) == len(values) and bool((rows == np.arange(len(rows))).all())

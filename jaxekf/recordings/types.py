@@ -1,14 +1,14 @@
 """A recorded run in memory: streams of samples with exact times, on the host, in NumPy.
 
-Times are int64 nanoseconds and never pass through a float. Values are SI. A sample that is there but
-not to be believed (a hidden tracker, a zero quaternion) is invalid, not removed.
+Times are int64 nanoseconds and never pass through a float. Values are SI. A sample that must not be used
+(a hidden tracker, a zero quaternion) is invalid, not removed.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ Flags = NDArray[np.bool_]
 NANOSECONDS = 1_000_000_000
 
 STREAMS = ("optical", "markers", "camera", "imu", "encoder")
-"""What a recording may hold."""
+"""Streams that have a class and a field of `Recording` of their own; any other is a `PlainStream`."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,59 @@ class Samples:
     """Groups in a sample, those included that only fill it up."""
 
 
+class _Stream:
+    """Shared by all streams."""
+
+    per_sample: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields that have one entry for each sample, without the times."""
+    time_ns: Times
+    latency_ns: int = 0
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """Arrays with one entry for each sample, by name, ``time_ns`` first."""
+        named = {name: getattr(self, name) for name in ("time_ns", *self.per_sample)}
+        return {name: value for name, value in named.items() if value is not None}
+
+    @property
+    def seen(self) -> Flags:
+        """(N,) True where some part of the sample is usable."""
+        return np.ones(len(self.time_ns), bool)
+
+    def take(self, chosen: Any) -> Self:
+        """The stream with the chosen samples only (flags or indices)."""
+        return replace(self, **{name: value[chosen] for name, value in self.arrays.items()})  # pyright: ignore
+
+
 @dataclass(frozen=True)
-class Optical:
+class PlainStream(_Stream):
+    """Columns of numbers that no built-in model reads, for a model of one's own; see `jaxekf.io.schema`."""
+
+    time_ns: Times
+    """Stamps; a sample was taken `latency_ns` before."""
+    values: Mapping[str, Floats]
+    """Arrays (N, c) by field, SI units; NaN where a cell is blank."""
+    latency_ns: int = 0
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """The times and all fields."""
+        return {"time_ns": self.time_ns, **self.values}
+
+    @property
+    def seen(self) -> Flags:
+        """(N,) True where some field is finite."""
+        finite = [np.isfinite(value).all(axis=1) for value in self.values.values()]
+        return np.asarray(np.any(finite, axis=0))
+
+    def take(self, chosen: Any) -> Self:
+        """The stream with the chosen samples only (flags or indices)."""
+        kept = {name: value[chosen] for name, value in self.values.items()}
+        return replace(self, time_ns=self.time_ns[chosen], values=kept)
+
+
+@dataclass(frozen=True)
+class Optical(_Stream):
     """Attitude, and often position, of the tool in the tracker's reference frame."""
 
     time_ns: Times
@@ -73,9 +124,14 @@ class Optical:
 
     per_sample: ClassVar = ("q_ref_body", "valid", "position", "error")
 
+    @property
+    def seen(self) -> Flags:
+        """(N,) as `valid`."""
+        return self.valid
+
 
 @dataclass(frozen=True)
-class Markers:
+class Markers(_Stream):
     """Single optical markers of one rigid tool, each in the tracker's reference frame."""
 
     time_ns: Times
@@ -106,6 +162,11 @@ class Markers:
                 usable &= ~(self.quality < self.quality_min)
         return usable
 
+    @property
+    def seen(self) -> Flags:
+        """(N,) True where any part is usable."""
+        return np.asarray(self.usable.any(axis=1))
+
     def __post_init__(self) -> None:
         count = len(self.names)
         shapes = {
@@ -125,7 +186,7 @@ class Markers:
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(_Stream):
     """Where landmarks of known places appear in the images of a camera that is fixed to the body."""
 
     time_ns: Times
@@ -160,6 +221,11 @@ class Camera:
         """(N, L): found, and finite."""
         return self.visible & np.isfinite(self.pixel).all(axis=2)
 
+    @property
+    def seen(self) -> Flags:
+        """(N,) True where any part is usable."""
+        return np.asarray(self.usable.any(axis=1))
+
     def __post_init__(self) -> None:
         count, images = len(self.names), len(self.time_ns)
         if count == 0:
@@ -190,7 +256,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Imu:
+class Imu(_Stream):
     """Gyroscope, and where recorded accelerometer and magnetometer, in the body frame."""
 
     time_ns: Times
@@ -205,7 +271,7 @@ class Imu:
 
 
 @dataclass(frozen=True)
-class Encoder:
+class Encoder(_Stream):
     """Truth from the robot's joints, in the tracker's reference frame: attitude, maybe position."""
 
     time_ns: Times
@@ -218,6 +284,11 @@ class Encoder:
     """(N, 3) metres: position of the body's origin in the reference frame."""
 
     per_sample: ClassVar = ("q_ref_body", "valid", "scored", "position")
+
+    @property
+    def seen(self) -> Flags:
+        """(N,) as `valid`."""
+        return self.valid
 
 
 @dataclass(frozen=True)
@@ -238,7 +309,9 @@ class Recording:
     intake: Mapping[str, Intake] = field(default_factory=dict)
     """What became of the rows of each stream's source while it was read; empty of a run made in memory."""
     sources: Mapping[str, str] = field(default_factory=dict)
-    """SHA-256 of each file it was read from, by name; empty where the reader did not tell."""
+    """SHA-256 of each file it was read from, by name; empty for an importer that reports none."""
+    others: Mapping[str, PlainStream] = field(default_factory=dict)
+    """Streams besides those above, by name."""
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):
@@ -248,14 +321,53 @@ class Recording:
                 "a name that can be a folder's",
                 "changing it in recording.toml",
             )
-        for label in STREAMS:
-            stream = getattr(self, label)
-            if stream is not None:
-                _check_stream(self.path or self.name, label, stream)
+        for label, stream in self.streams.items():
+            _check_stream(self.path or self.name, label, stream)
+
+    @property
+    def streams(self) -> dict[str, Any]:
+        """All streams that there are, by name."""
+        known = {label: getattr(self, label) for label in STREAMS}
+        return {k: stream for k, stream in known.items() if stream is not None} | dict(self.others)
 
     def replace(self, **changes: Any) -> "Recording":
         """A copy with some streams or facts changed."""
         return replace(self, **changes)
+
+    def with_streams(self, streams: Mapping[str, Any], **changes: Any) -> "Recording":
+        """A copy with these streams in place of those of the same names; None removes one."""
+        built_in = {label: stream for label, stream in streams.items() if label in STREAMS}
+        others = {**self.others, **{k: v for k, v in streams.items() if k not in STREAMS}}
+        others = {label: stream for label, stream in others.items() if stream is not None}
+        return replace(self, **built_in, others=others, **changes)
+
+    def samples(self, label: str, name: str) -> Samples:
+        """A field of a plain stream as a sensor's `source` returns it, masked where it is not finite.
+
+        Parameters
+        ----------
+        label
+            Name of the stream, such as ``force_torque``.
+        name
+            Field of the stream, such as ``force``.
+
+        Raises
+        ------
+        RecordingError
+            Without that stream or that field.
+        """
+        stream = self._need(label)
+        if name not in stream.values:
+            raise RecordingError(
+                self.path or self.name,
+                f"no field {name} of {label}",
+                f"one of {', '.join(stream.values)}",
+                f"adding its columns to {label}.csv, or another field",
+            )
+        value = stream.values[name]
+        finite = np.isfinite(value).all(axis=1)
+        taken = stream.time_ns - stream.latency_ns
+        return Samples(taken, value, finite, latency_ns=stream.latency_ns, origin=(label,))
 
     def need_optical(self) -> Optical:
         """The optical stream, or an error that names the run."""
@@ -278,7 +390,7 @@ class Recording:
         return self._need("encoder")
 
     def _need(self, label: str) -> Any:
-        stream = getattr(self, label)
+        stream = self.streams.get(label)
         if stream is None:
             raise RecordingError(
                 self.path or self.name,
@@ -299,9 +411,8 @@ def _check_stream(place: Path | str, label: str, stream: Any) -> None:
             "int64 nanoseconds",
             "casting them exactly",
         )
-    for key in stream.per_sample:
-        value = getattr(stream, key)
-        if value is not None and len(value) != len(times):
+    for key, value in stream.arrays.items():
+        if len(value) != len(times):
             raise RecordingError(
                 place,
                 f"{len(value)} values of {label}.{key} for {len(times)} times",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _encoder as encoder_storage
 from jaxekf.io.importers._bags import Bag, Topic
+from jaxekf.io.streams import encoder as encoder_storage
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import NANOSECONDS, Encoder, Flags, Floats, Imu, Optical, Times

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jaxekf.checks.inspection import Inspection, StreamFound
-from jaxekf.recordings.types import NANOSECONDS, STREAMS, Flags, Floats, Recording, Times
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Recording, Times
 from jaxekf.reporting.plots.style import ESTIMATE, REFUSED, new_figure, styled
 
 _BINS = 400
@@ -71,12 +71,8 @@ def _lanes(
 ) -> dict[str, tuple[StreamFound, Times, dict[str, Flags]]]:
     """What was found, times and masked samples by reason, for each lane."""
     lanes = {}
-    for label in STREAMS:
-        stream: Any = getattr(recording, label)
-        if stream is None:
-            continue
-        late = getattr(stream, "latency_ns", 0)
-        time_ns = stream.time_ns - late
+    for label, stream in recording.streams.items():
+        time_ns = stream.time_ns - stream.latency_ns
         if label == "markers":
             for i, (name, told) in enumerate(found.markers.items()):
                 lost = {"hidden, or of too little quality": ~stream.usable[:, i]}

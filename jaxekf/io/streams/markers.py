@@ -1,14 +1,12 @@
-"""Single optical markers on disk: one line for each marker and frame, the geometry in `recording.toml`.
+"""Single optical markers of one rigid tool.
 
-``markers.csv``  time,marker,x,y,z[,quality][,error]
-
-The lines of a frame share exactly one time and stand together. A marker whose x,y,z are blank, or that
-has no line, is hidden. The section ``[markers]`` holds `latency` (s), `quality_min`, and
-``[markers.geometry]`` with ``NAME = [x, y, z]``: each marker's place in the body frame, in metres.
+In `markers.csv` each marker of each frame has a line. The lines of a frame are consecutive and share one
+time. A marker without a line, or with blank x,y,z, is hidden.
 """
 
 import json
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +15,30 @@ import numpy as np
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _stream_options as stream_options
 from jaxekf.io import description
-from jaxekf.io._frame_rows import NAMES, bad_name, frames, part_of_each_line
-from jaxekf.io.csv_table import POSITION, Sheet, Table, need_columns, numbers, reported
+from jaxekf.io._frame_rows import (
+    NAMES,
+    bad_name,
+    check_names,
+    dense_frames,
+    frames,
+    part_of_each_line,
+)
+from jaxekf.io.csv_table import POSITION, Sheet, Table, numbers, reported
+from jaxekf.io.schema import FLAG, TEXT, Field, Option, StreamSchema, latency
 from jaxekf.recordings import facts, screening
-from jaxekf.recordings.accounts import Indices, Intake
+from jaxekf.recordings.accounts import Indices, Intake, Place
 from jaxekf.recordings.types import Floats, Markers
 
-DESCRIBED = {"kind": "markers", "unit": "m"}
-LAYOUT = "time,marker,x,y,z[,quality][,error]"
 
-
-def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
+def _read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     """The frames of `markers.csv`, markers in the order of the geometry.
 
     Hidden markers are NaN, as are qualities and errors that were not reported. Raises
     `RecordingError` for a marker without a place in the geometry or twice in a frame, for times that
     decrease, and for what is not a finite number.
     """
-    need_columns(table, LAYOUT)
     about, place = source.about, source.place
-    (length,) = stream_options.factors("markers", about, place)
+    (length,) = stream_options.factors("markers", ("m",), about, place)
     names, p_body_marker = _geometry(about.get("geometry"), place)
     position = length * numbers(table, POSITION, blank=True)
     error = reported(table, "error", least=0.0)
@@ -65,7 +67,7 @@ def read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     return stream, account
 
 
-def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
+def _write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
     """One line for every marker of every frame, so that no frame and no reported number is lost.
 
     A marker that is not visible, or has no finite position, gets blank cells.
@@ -80,7 +82,7 @@ def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]
         if numbers is not None:
             columns.append(key)
             values.append(numbers.reshape(-1, 1))
-    about |= DESCRIBED | description.latency_entry(stream.latency_ns)
+    about |= {**SCHEMA.described} | description.latency_entry(stream.latency_ns)
     if stream.quality_min:
         about["quality_min"] = float(stream.quality_min)
     about["geometry"] = {
@@ -89,6 +91,40 @@ def write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]
     }
     times = np.repeat(stream.time_ns, count)
     return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * frames), about
+
+
+def _screen(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers, Intake]:
+    """Frames from arrays. In the account each marker of each frame is a row, by the number of its frame."""
+    position, names = group["position"], group["names"]
+    check_names(place, names, "marker")
+    for i, point in enumerate(group["p_body_marker"]):
+        facts.finite_vector(point, 3, place.path, f"p_body_marker[{i}]")
+    stated = group.get("visible", np.ones(position.shape[:2], bool))
+    rows = [position, stated] + [group[key] for key in ("quality", "error") if key in group]
+    time, order, account = dense_frames(place, group["time_ns"], rows, names, sort)
+    each, count = np.repeat(np.arange(len(order)), len(names)), len(names)
+    seen, account = screening.judge_markers(
+        place.take(order).take(each),
+        time[each],
+        position[order].reshape(-1, 3),
+        np.tile(np.arange(count), len(order)),
+        account,
+        seen=stated[order].reshape(-1) if "visible" in group else None,
+    )
+    quality = screening.check_reported(place, "quality", group.get("quality"))
+    error = screening.check_reported(place, "error", group.get("error"), least=0.0)
+    least = facts.finite_number(float(group.get("quality_min", 0.0)), place.path, "quality_min")
+    return Markers(
+        time,
+        position[order],
+        seen.reshape(len(order), count),
+        names,
+        group["p_body_marker"],
+        quality=None if quality is None else quality[order],
+        quality_min=least,
+        error=None if error is None else error[order],
+        latency_ns=int(group.get("latency_ns", 0)),
+    ), account
 
 
 def _geometry(geometry: Any, place: Path | str) -> tuple[tuple[str, ...], Floats]:
@@ -142,3 +178,49 @@ def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
         )
 
     return part_of_each_line(table, "marker", names, unknown)
+
+
+SCHEMA = StreamSchema(
+    "markers",
+    "Single optical markers of one rigid tool, each in the tracker's reference frame.",
+    {
+        "names": Field(TEXT, ("M",), needed=True, columns=("marker",), about="name of the marker"),
+        "position": Field(
+            shape=("N", "M", 3),
+            unit="m",
+            frame="reference",
+            needed=True,
+            columns=POSITION,
+            about="position; blank where the marker is hidden",
+        ),
+        "visible": Field(FLAG, ("N", "M"), "1", about="whether the marker is visible"),
+        "p_body_marker": Field(
+            shape=("M", 3),
+            unit="m",
+            frame="body",
+            needed=True,
+            about="position of the marker in the body, in the order of `names`",
+        ),
+        "quality": Field(
+            shape=("N", "M"), columns=("quality",), about="reported quality, larger is better"
+        ),
+        "quality_min": Field(
+            shape=(),
+            about="least quality of a marker that is used (default 0)",
+            option="quality_min",
+        ),
+        "error": Field(
+            shape=("N", "M"), unit="m", columns=("error",), about="reported fit error", least=0.0
+        ),
+        "latency_ns": latency(),
+    },
+    options={
+        "geometry": Option(
+            "NAME = [x, y, z] under [markers.geometry], m", "position of each marker in the body"
+        )
+    },
+    described={"kind": "markers", "unit": "m"},
+    read=_read,
+    write=_write,
+    screen=_screen,
+)

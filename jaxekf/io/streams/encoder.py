@@ -1,10 +1,4 @@
-"""Truth from a robot's joints on disk.
-
-``encoder.csv``  time,angle[,scored]  or  time,qw,qx,qy,qz[,x,y,z][,scored]
-
-The section ``[encoder]`` of `recording.toml` says where a joint's axis lies, and how the encoder's frame
-lies in the tracker's (`q_optical_encoder`, `p_optical_encoder`).
-"""
+"""Truth from a robot's joints: one joint's angle, or poses."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,20 +17,17 @@ from jaxekf.io.csv_table import (
     Sheet,
     Table,
     flags,
-    need_columns,
     numbers,
     stamps,
     whole_or_blank,
 )
+from jaxekf.io.schema import FLAG, Field, Option, StreamSchema
 from jaxekf.recordings import facts, screening
-from jaxekf.recordings.accounts import Intake
+from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Encoder, Floats, from_scipy, to_scipy
 
-DESCRIBED = {"quaternion": facts.BODY_TO_REFERENCE}
-LAYOUTS = ("time,angle[,scored]", "time,qw,qx,qy,qz[,x,y,z][,scored]")
 
-
-def read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
+def _read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     """Attitude of the tool from a joint angle or a quaternion, in the tracker's frame.
 
     With an angle: ``q = q_zero exp(axis angle)`` where the axis is fixed in the body
@@ -44,19 +35,18 @@ def read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     ``q_optical_encoder`` turns the encoder's frame into the tracker's, and ``p_optical_encoder`` is
     its origin there, in metres. A blank position is NaN.
     """
-    need_columns(table, *LAYOUTS)
     about, place = source.about, source.place
     scored, position = flags(table, "scored"), None
     frame = _fixed_rotation(about, "q_optical_encoder", place)
     if "angle" in table.columns:
-        (scale,) = stream_options.factors("joint", about, place)
+        (scale,) = stream_options.factors("encoder", ("rad",), about, place)
         length = 1.0
         angle = scale * numbers(table, ("angle",), blank=True)[:, 0]
         known = np.isfinite(angle)
         q = joint_attitude(np.where(known, angle, 0.0), about, place)
         q[~known] = np.nan
     else:
-        _, length = stream_options.factors("encoder", about, place)
+        _, length = stream_options.factors("encoder", ("1", "m"), about, place)
         turning = stream_options.turning("encoder", about, place)
         q = turning.standard(numbers(table, turning.columns(table.columns), blank=True))
     if set(POSITION) <= set(table.columns):
@@ -90,7 +80,7 @@ def joint_attitude(angle: Floats, about: Mapping[str, Any], place: Path | str) -
     return from_scipy(turn * zero if side == "reference" else zero * turn)
 
 
-def write(stream: Encoder, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
+def _write(stream: Encoder, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
     """A joint angle again where the description is of a joint, else quaternions.
 
     A joint angle has no place for a position or for samples that are missing: those are kept, as
@@ -109,7 +99,7 @@ def write(stream: Encoder, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]
         for key in ("axis", "acts_on", "q_zero", "q_optical_encoder", "p_optical_encoder"):
             about.pop(key, None)
         unit = "1" if stream.position is None else "1, m"
-        about |= {"kind": "attitude", "unit": unit} | DESCRIBED
+        about |= {"kind": "attitude", "unit": unit} | dict(SCHEMA.described)
     if not stream.scored.all():
         columns, values = [*columns, "scored"], np.c_[values, stream.scored.astype(float)]
     return Sheet(columns, stream.time_ns, values), about
@@ -129,3 +119,67 @@ def _joint_angle(stream: Encoder, about: Mapping[str, Any]) -> Floats:
 def _fixed_rotation(about: Mapping[str, Any], key: str, place: Path | str) -> Rotation:
     value = about.get(key, [1.0, 0.0, 0.0, 0.0])
     return to_scipy(facts.unit_vector(value, 4, place, f"encoder.{key}"))
+
+
+def _screen(place: Place, arrays: Mapping[str, Any], sort: bool) -> tuple[Encoder, Intake]:
+    return screening.encoder(
+        place,
+        arrays["time_ns"],
+        arrays["q_ref_body"],
+        arrays.get("position"),
+        scored=arrays.get("scored"),
+        hidden=~arrays["valid"] if "valid" in arrays else None,
+        sort=sort,
+    )
+
+
+SCHEMA = StreamSchema(
+    "encoder",
+    "Truth from a robot's joints: attitude, and maybe position, in the tracker's reference frame.",
+    {
+        "q_ref_body": Field(
+            shape=("N", 4),
+            unit="1",
+            frame=facts.BODY_TO_REFERENCE,
+            needed=True,
+            columns=QUATERNION,
+            about="attitude, in the encoder's frame; or the column `angle` of one joint, rad",
+        ),
+        "valid": Field(FLAG, unit="1", about="whether the sample is usable"),
+        "scored": Field(
+            FLAG,
+            unit="1",
+            columns=("scored",),
+            about="whether estimates are compared here (0 or 1)",
+        ),
+        "position": Field(
+            shape=("N", 3),
+            unit="m",
+            frame="reference",
+            columns=POSITION,
+            about="position of the body's origin, in the encoder's frame",
+        ),
+    },
+    options={
+        "axis": Option("[x, y, z]", "axis of the joint, for the column `angle`", held=False),
+        "acts_on": Option(
+            '"reference" or "body"',
+            'frame in which the axis is fixed (default "reference")',
+            held=False,
+        ),
+        "q_zero": Option("[w, x, y, z]", "attitude at angle 0 (default: identity)", held=False),
+        "q_optical_encoder": Option(
+            "[w, x, y, z]", "rotation from encoder to tracker frame (default: identity)", held=False
+        ),
+        "p_optical_encoder": Option(
+            "[x, y, z], m",
+            "origin of the encoder frame in the tracker frame (default 0)",
+            held=False,
+        ),
+    },
+    described={"quaternion": facts.BODY_TO_REFERENCE},
+    layouts=("time,angle[,scored]", "time,qw,qx,qy,qz[,x,y,z][,scored]"),
+    read=_read,
+    write=_write,
+    screen=_screen,
+)

@@ -1,11 +1,9 @@
-"""Landmarks in a camera's images on disk: one line for each landmark and image, the places beside them.
+"""Image points of known landmarks, from a camera that is fixed to the body.
 
-``camera.csv``     time,landmark,u,v[,sigma]    pixels
-``landmarks.csv``  landmark,x,y,z               in the reference frame
-
-The lines of an image share exactly one time and stand together. A landmark whose u,v are blank, or that
-has no line, was not found there. The section ``[camera]`` holds `focal` and `centre` (pixels), `radial`,
-`p_body_camera` (m), `q_body_camera`, `latency` (s), and the `unit` of the places in `landmarks.csv`.
+In `camera.csv` each landmark of each image has a line. The lines of an image are consecutive and share
+one time. A landmark without a line, or with blank u,v, was not found. `landmarks.csv` (landmark,x,y,z)
+beside it has the landmarks' positions in the reference frame; ``unit`` in the section ``[camera]`` is
+theirs.
 """
 
 import csv
@@ -18,7 +16,14 @@ import numpy as np
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _stream_options as stream_options
 from jaxekf.io import description
-from jaxekf.io._frame_rows import NAMES, bad_name, frames, part_of_each_line
+from jaxekf.io._frame_rows import (
+    NAMES,
+    bad_name,
+    check_names,
+    dense_frames,
+    frames,
+    part_of_each_line,
+)
 from jaxekf.io.csv_table import (
     POSITION,
     Sheet,
@@ -29,32 +34,30 @@ from jaxekf.io.csv_table import (
     reported,
     words,
 )
+from jaxekf.io.schema import FLAG, TEXT, Field, Option, StreamSchema, latency
 from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Indices, Intake, Place
 from jaxekf.recordings.types import Camera, Floats
 
-DESCRIBED = {"kind": "camera", "unit": "m, px"}
-LAYOUT = "time,landmark,u,v[,sigma]"
 LANDMARKS = "landmark,x,y,z"
-HELD = ("latency", "focal", "centre", "radial", "p_body_camera", "q_body_camera")
+_OPTICS = ("focal", "centre", "radial", "p_body_camera", "q_body_camera")
 _SHOWN = 10
 """Names of landmarks that a message lists: a scene may have thousands."""
 
 
-def read(table: Table, source: description.Source, landmarks: Table) -> tuple[Camera, Intake]:
+def _read(table: Table, source: description.Source, landmarks: Table) -> tuple[Camera, Intake]:
     """The images of `camera.csv`, landmarks in the order of `landmarks.csv`.
 
     Points of landmarks that were not found are NaN, as are deviations that were not reported. Raises
     `RecordingError` for a landmark without a place or twice in an image, for times that decrease, for what
     is not a finite number, and for a camera of which too little is said.
     """
-    need_columns(table, LAYOUT)
     about, place = source.about, source.place
-    length, _ = stream_options.factors("camera", about, place)
-    said = optics(about, place, "camera.")
+    length, _ = stream_options.factors("camera", ("m", "px"), about, place)
+    said = _optics(about, place, "camera.")
     names, p_ref_landmark = _places(landmarks, length)
     pixel, sigma = numbers(table, ("u", "v"), blank=True), reported(table, "sigma")
-    check_sigma(table.place, sigma)
+    _check_sigma(table.place, sigma)
     landmark = _landmark_of_each_line(table, names, landmarks)
     columns = [pixel] if sigma is None else [pixel, sigma]
     made, account = frames(
@@ -83,14 +86,14 @@ def read(table: Table, source: description.Source, landmarks: Table) -> tuple[Ca
     return stream, account
 
 
-def write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
+def _write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
     """One line for every landmark of every image, so that no image and no deviation is lost.
 
     A landmark that is not visible, or has no finite point, gets blank cells. Raises `RecordingError` for
     what could not be read again.
     """
-    check_names(Place("camera"), stream.names)
-    check_sigma(Place("camera"), stream.sigma)
+    check_names(Place("camera"), stream.names, "landmark")
+    _check_sigma(Place("camera"), stream.sigma)
     seen = stream.usable
     if not seen.any():
         raise RecordingError(
@@ -104,17 +107,17 @@ def write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]
     if stream.sigma is not None:
         columns.append("sigma")
         values.append(stream.sigma.reshape(-1, 1))
-    said = {key: getattr(stream, key) for key in HELD if key != "latency"}
-    about |= DESCRIBED | description.latency_entry(stream.latency_ns)
-    about |= {key: value.tolist() for key, value in optics(said, facts.FILE, "camera.").items()}
+    said = {key: getattr(stream, key) for key in _OPTICS}
+    about |= {**SCHEMA.described} | description.latency_entry(stream.latency_ns)
+    about |= {key: value.tolist() for key, value in _optics(said, facts.FILE, "camera.").items()}
     images, count = seen.shape
     times = np.repeat(stream.time_ns, count)
     return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * images), about
 
 
-def write_landmarks(stream: Camera, path: Path) -> None:
+def _write_landmarks(stream: Camera, path: Path) -> None:
     """`landmarks.csv`, to the last bit whatever the digits of samples: a place is no sample."""
-    check_places(Place(path.name), stream.p_ref_landmark)
+    _check_places(Place(path.name), stream.p_ref_landmark)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(LANDMARKS.split(","))
@@ -122,7 +125,7 @@ def write_landmarks(stream: Camera, path: Path) -> None:
             writer.writerow([name, *(f"{value:.17g}" for value in point)])
 
 
-def optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[str, Floats]:
+def _optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[str, Floats]:
     """Fields of `Camera` that say what it is and where it sits, where they are said.
 
     Raises `RecordingError`, which names the entry with `head` before it, for a focal length or centre that
@@ -156,7 +159,7 @@ def optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[s
     return found
 
 
-def check_sigma(place: Place, sigma: Floats | None) -> None:
+def _check_sigma(place: Place, sigma: Floats | None) -> None:
     """Deviations (N, ...) are positive, finite, or NaN where none was reported: a point without any error
     would overrule all else."""
     if sigma is None:
@@ -174,16 +177,39 @@ def check_sigma(place: Place, sigma: Floats | None) -> None:
         )
 
 
-def check_names(place: Place, names: tuple[str, ...]) -> None:
-    """Each landmark has a name of its own, such as a CSV file can hold, and there is one."""
-    if not names:
-        raise place.error(None, None, "no landmark", "at least one", "giving its name and place")
-    bad = bad_name(names)
-    if bad is not None:
-        raise place.error(bad, "names", repr(names[bad]), NAMES, "renaming the landmark")
+def _screen(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Camera, Intake]:
+    """Images from arrays. In the account each landmark of each image is a row, by the number of its
+    image."""
+    pixel, names, sigma = group["pixel"], group["names"], group.get("sigma")
+    check_names(place, names, "landmark")
+    _check_places(place, group["p_ref_landmark"])
+    _check_sigma(place, sigma)
+    optics = _optics(group, place.path)
+    stated = group.get("visible", np.ones(pixel.shape[:2], bool))
+    rows = [pixel, stated] if sigma is None else [pixel, stated, sigma]
+    slowest = screening.SLOWEST_TRACKER_S
+    time, order, account = dense_frames(place, group["time_ns"], rows, names, sort, slowest)
+    each = np.repeat(np.arange(len(order)), len(names))
+    found, account = screening.judge_points(
+        place.take(order).take(each),
+        time[each],
+        pixel[order].reshape(-1, 2),
+        account,
+        seen=stated[order].reshape(-1) if "visible" in group else None,
+    )
+    return Camera(
+        time,
+        pixel[order],
+        found.reshape(len(order), len(names)),
+        names,
+        group["p_ref_landmark"],
+        sigma=None if sigma is None else sigma[order],
+        latency_ns=int(group.get("latency_ns", 0)),
+        **optics,
+    ), account
 
 
-def check_places(place: Place, places: Floats) -> None:
+def _check_places(place: Place, places: Floats) -> None:
     """Every landmark (L, 3) is somewhere."""
     bad = np.flatnonzero(~np.isfinite(places).all(axis=1))
     if bad.size:
@@ -237,3 +263,64 @@ def _landmark_of_each_line(table: Table, names: tuple[str, ...], places: Table) 
         )
 
     return part_of_each_line(table, "landmark", names, unknown)
+
+
+def _optic(size: int, unit: str, about: str, *, frame: str = "", needed: bool = False) -> Field:
+    return Field(shape=(size,), unit=unit, frame=frame, needed=needed, about=about)
+
+
+SCHEMA = StreamSchema(
+    "camera",
+    "Image points of landmarks whose positions are known, from a camera that is fixed to the body.",
+    {
+        "names": Field(
+            TEXT, ("L",), needed=True, columns=("landmark",), about="name of the landmark"
+        ),
+        "pixel": Field(
+            shape=("N", "L", 2),
+            unit="px",
+            frame="image, u to the right, v down",
+            needed=True,
+            columns=("u", "v"),
+            about="image point; blank where the landmark was not found",
+        ),
+        "visible": Field(FLAG, ("N", "L"), "1", about="whether the landmark was found"),
+        "p_ref_landmark": Field(
+            shape=("L", 3),
+            unit="m",
+            frame="reference",
+            needed=True,
+            about="position of the landmark, in `landmarks.csv`",
+        ),
+        "focal": _optic(2, "px", "focal lengths", needed=True),
+        "centre": _optic(2, "px", "image point of the optical axis", needed=True),
+        "radial": _optic(2, "1", "radial distortion (default 0, 0)"),
+        "p_body_camera": _optic(3, "m", "centre of the camera (default 0, 0, 0)", frame="body"),
+        "q_body_camera": _optic(
+            4,
+            "1",
+            "orientation of the camera (default 1, 0, 0, 0)",
+            frame="w,x,y,z, camera to body",
+        ),
+        "sigma": Field(
+            shape=("N", "L"),
+            unit="px",
+            columns=("sigma",),
+            about="reported standard deviation of the image point",
+        ),
+        "latency_ns": latency(),
+    },
+    options={
+        "focal": Option("[fx, fy], px", "focal lengths"),
+        "centre": Option("[cx, cy], px", "image point of the optical axis"),
+        "radial": Option("[k1, k2]", "radial distortion (default 0, 0)"),
+        "p_body_camera": Option("[x, y, z], m", "centre of the camera in the body (default 0)"),
+        "q_body_camera": Option("[w, x, y, z]", "rotation from camera to body (default: identity)"),
+    },
+    described={"kind": "camera", "unit": "m, px"},
+    units=("m", "px"),
+    read=_read,
+    write=_write,
+    beside={description.LANDMARKS: _write_landmarks},
+    screen=_screen,
+)

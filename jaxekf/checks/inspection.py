@@ -15,7 +15,7 @@ from jaxekf.checks._camera_agreement import (
 )
 from jaxekf.checks.plausibility import FARTHEST_M, Evidence, check, evidence
 from jaxekf.checks.sensor_agreement import overlap_s
-from jaxekf.recordings.types import NANOSECONDS, STREAMS, Flags, Recording, Times
+from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times
 
 GAP = 1.5
 """Median steps from which on a step is a gap."""
@@ -109,11 +109,7 @@ class Inspection:
 
 def inspect(recording: Recording) -> Inspection:
     """Look at a run; nothing that is found raises."""
-    streams = {
-        label: _stream(recording, label)
-        for label in STREAMS
-        if getattr(recording, label) is not None
-    }
+    streams = {label: _stream(recording, label) for label in recording.streams}
     found = evidence(recording)
     faults, warnings, notes = [], [], []
     try:
@@ -156,12 +152,8 @@ def inspect(recording: Recording) -> Inspection:
 
 
 def _stream(recording: Recording, label: str) -> StreamFound:
-    stream: Any = getattr(recording, label)
-    usable = np.ones(len(stream.time_ns), bool)
-    if label in ("optical", "encoder"):
-        usable = stream.valid
-    elif label in ("markers", "camera"):
-        usable = stream.usable.any(axis=1)
+    stream = recording.streams[label]
+    usable = stream.seen
     account = recording.intake.get(label)
     masked, dropped = {}, {}
     if account is not None:
@@ -169,7 +161,7 @@ def _stream(recording: Recording, label: str) -> StreamFound:
         dropped = {name: reason.count for name, reason in account.dropped.items()}
     elif not usable.all():
         masked = {"not valid": int((~usable).sum())}
-    return _found(stream.time_ns - getattr(stream, "latency_ns", 0), usable, masked, dropped)
+    return _found(stream.time_ns - stream.latency_ns, usable, masked, dropped)
 
 
 def _markers(recording: Recording) -> dict[str, StreamFound]:

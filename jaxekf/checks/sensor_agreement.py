@@ -16,7 +16,6 @@ from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.facts import BODY_TO_REFERENCE
 from jaxekf.recordings.types import (
     NANOSECONDS,
-    STREAMS,
     Floats,
     Imu,
     Markers,
@@ -147,12 +146,9 @@ def evidence(recording: Recording) -> Evidence:
 
 def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
     found = {}
-    for label in STREAMS:
-        stream = getattr(recording, label)
-        if stream is not None:
-            late = getattr(stream, "latency_ns", 0)
-            first, last = int(stream.time_ns[0]) - late, int(stream.time_ns[-1]) - late
-            found[label] = (first / NANOSECONDS, last / NANOSECONDS)
+    for label, stream in recording.streams.items():
+        first, last = (int(t) - stream.latency_ns for t in stream.time_ns[[0, -1]])
+        found[label] = (first / NANOSECONDS, last / NANOSECONDS)
     return found
 
 

@@ -382,7 +382,7 @@ def test_truncated(tmp_path, suffix):
         message = refusal(path)
         assert "truncated" in message and f"{size} bytes" in message
         if suffix == ".h5" and size >= 100:
-            assert f"{len(whole)} bytes, as its superblock says" in message
+            assert f"{len(whole)} bytes, as its superblock states" in message
         if suffix == ".npz" and 100 <= size < len(whole) - 1:
             told.append("ends at byte" in message)
     assert suffix == ".h5" or any(told)

@@ -1,6 +1,6 @@
 """HDF5 and NPZ files as named arrays: what a file declares is judged before anything is read.
 
-Nothing that a file holds is believed: sizes are held against the file's own, pickled objects are never
+No file is trusted: declared sizes are compared with the file's own, pickled objects are never
 loaded, links to other files never followed, and what the libraries raise becomes one `RecordingError`.
 """
 
@@ -30,20 +30,20 @@ class Stored(NamedTuple):
     """One array of a file, not yet read."""
 
     dtype: np.dtype
-    """Of HDF5's texts of any length ``object``."""
+    """``object`` for texts of any length in HDF5."""
     shape: tuple[int, ...]
     read: Callable[[], NDArray[Any]]
 
 
 class Content(NamedTuple):
-    """What an open file holds."""
+    """Content of an open file."""
 
     arrays: dict[str, Stored]
     """By path, ``optical/time_ns``; of the groups that were asked for."""
-    said: dict[str, Any]
+    attributes: dict[str, Any]
     """Attributes of the root by name, and of the arrays as ``optical/time_ns@unit``."""
     others: list[str]
-    """What else is there, and is not read."""
+    """Names of everything else, which is not read."""
 
 
 @contextmanager
@@ -68,10 +68,10 @@ def open_container(path: Path, groups: tuple[str, ...], root: tuple[str, ...]) -
     except RecordingError:
         raise
     except Exception as error:
-        told = " ".join(str(error).split()) or type(error).__name__
+        message = " ".join(str(error).split()) or type(error).__name__
         raise RecordingError(
             path,
-            f"a damaged file ({told})",
+            f"a damaged file ({message})",
             f"a whole {form.upper()} file",
             "copying or exporting it again",
         ) from None
@@ -111,12 +111,12 @@ def _npz_content(
         if (packed and name in root) or ("/" in name and head in groups and not info.is_dir()):
             members[name] = _npz_stored(path, archive, info)
         else:
-            # Where the directory and the member itself tell other names, a name of ours may be damaged.
+            # Where the directory and the member itself have different names, a name of ours may be damaged.
             archive.open(info).close()
             others.append(name)
     check_sizes(path, members)
-    said = {n: _text(path, n, members.pop(n)) for n in list(members) if n in root or "@" in n}
-    return Content(members, said, others)
+    attributes = {n: _text(path, n, members.pop(n)) for n in list(members) if n in root or "@" in n}
+    return Content(members, attributes, others)
 
 
 def _npz_stored(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Stored:
@@ -163,7 +163,7 @@ def _hdf5_content(
     path: Path, file: h5py.File, groups: tuple[str, ...], root: tuple[str, ...]
 ) -> Content:
     arrays: dict[str, Stored] = {}
-    said = {key: _attribute(path, file, key) for key in root if key in file.attrs}
+    attributes = {key: _attribute(path, file, key) for key in root if key in file.attrs}
     others = [str(name) for name in file if name not in groups]
     for group in (name for name in groups if name in file):
         node = _follow(path, file, group, h5py.Group, "a group")
@@ -173,13 +173,13 @@ def _hdf5_content(
             arrays[key] = _hdf5_stored(path, key, data)
             for about in ("unit", "frame"):
                 if about in data.attrs:
-                    said[f"{key}@{about}"] = _attribute(path, data, about, key)
+                    attributes[f"{key}@{about}"] = _attribute(path, data, about, key)
     check_sizes(path, arrays)
-    return Content(arrays, said, others)
+    return Content(arrays, attributes, others)
 
 
 def _follow(path: Path, node: Any, name: str, kind: type, wanted: str, key: str = "") -> Any:
-    """A group or data set that stands in this file: links that lead elsewhere are not followed."""
+    """A group or data set of this file; links to other files are not followed."""
     place, link = f"{path}:{key or name}", node.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
         raise RecordingError(
@@ -197,9 +197,7 @@ def _follow(path: Path, node: Any, name: str, kind: type, wanted: str, key: str 
 def _hdf5_stored(path: Path, key: str, data: Any) -> Stored:
     place = f"{path}:{key}"
     if data.is_virtual or data.external:
-        raise RecordingError(
-            place, "data that stand in other files", "data in the file itself", "h5repack"
-        )
+        raise RecordingError(place, "data in other files", "data in the file itself", "h5repack")
     filters = data.id.get_create_plist()
     for i in range(filters.get_nfilters()):
         number, _, _, name = filters.get_filter(i)
@@ -258,7 +256,7 @@ def _text(path: Path, key: str, stored: Stored) -> Any:
 
 
 def of_fixed_length(value: Any) -> Any:
-    """Texts as HDF5 holds them in place: those of any length stand in a heap, in which the library may
+    """Texts as HDF5 holds them in place: texts of any length are in a heap, in which the library may
     get lost where the file is damaged."""
     if not isinstance(value, str | tuple):
         return value

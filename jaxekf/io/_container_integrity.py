@@ -1,4 +1,4 @@
-"""Files that are not there, empty, truncated or of another kind, told before a library opens them."""
+"""Missing, empty, truncated and foreign files, found before a library opens them."""
 
 import mmap
 import zipfile
@@ -44,10 +44,10 @@ def check_whole_zip(path: Path) -> None:
     if head[:4] != _ZIP[: len(head)]:
         raise RecordingError(path, "a file that is not NPZ", "an NPZ file", "another file")
     member, end = _last_member(path, there)
-    told = f", and {member} alone ends at byte {end}" if end > there else ""
+    detail = f", and {member} alone ends at byte {end}" if end > there else ""
     raise RecordingError(
         path,
-        f"a truncated file: {there} bytes without the central directory of an NPZ file{told}",
+        f"a truncated file: {there} bytes without the central directory of an NPZ file{detail}",
         f"more than {max(end, there)} bytes",
         "copying or exporting it again",
     )
@@ -72,8 +72,8 @@ def _last_member(path: Path, there: int) -> tuple[str, int]:
 
 
 def check_whole_hdf5(path: Path) -> None:
-    """Raise `RecordingError` for what is no HDF5 file, is shorter than its superblock says, or would keep
-    the HDF5 library from ever coming back."""
+    """Raise `RecordingError` for a file that is no HDF5 file, is shorter than its superblock states, or
+    would keep the HDF5 library from ever coming back."""
     there = path.stat().st_size
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as view:
         at = 0
@@ -83,11 +83,11 @@ def check_whole_hdf5(path: Path) -> None:
                 _refuse_other(path, view[:8], there)
         stated, length = _superblock(view, at)
         if stated > there or there - at < _SMALLEST:
-            told = f"{stated} bytes, as its superblock says"
+            detail = f"{stated} bytes, as its superblock states"
             raise RecordingError(
                 path,
                 f"a truncated file: {there} bytes",
-                told if there - at >= _SMALLEST else f"more than {at + _SMALLEST} bytes",
+                detail if there - at >= _SMALLEST else f"more than {at + _SMALLEST} bytes",
                 "copying or exporting it again",
             )
         _refuse_endless_heaps(path, view, length)
@@ -97,8 +97,8 @@ def _refuse_other(path: Path, head: bytes, there: int) -> None:
     if head.startswith(_ZIP):
         raise RecordingError(path, "a ZIP (NPZ) file", "an HDF5 file", "the suffix .npz")
     if head == _SIGNATURE[: len(head)]:
-        told = f"a truncated file: {there} bytes, not even HDF5's signature"
-        raise RecordingError(path, told, "a whole HDF5 file", "copying or exporting it again")
+        detail = f"a truncated file: {there} bytes, not even HDF5's signature"
+        raise RecordingError(path, detail, "a whole HDF5 file", "copying or exporting it again")
     raise RecordingError(path, "a file that is not HDF5", "an HDF5 file", "another file")
 
 
@@ -114,7 +114,7 @@ def _superblock(view: Any, at: int) -> tuple[int, int]:
 
 
 def _refuse_endless_heaps(path: Path, view: Any, length_size: int) -> None:
-    """Raise where texts of any length stand in a heap over which the HDF5 library might never end.
+    """Raise where texts of any length are in a heap over which the HDF5 library might never end.
 
     It walks a heap's objects by their size, modulo 2^64; a free one (number 0) of size 0, or what an object
     that runs past the end leads to, keeps it where it is.

@@ -34,7 +34,7 @@ def check_names(place: str, label: str, names: set[str], fields: Mapping[str, Fi
 
 
 def check_described(place: str, key: str, about: Mapping[str, str], field: Field) -> None:
-    """Unit and frame are what this version reads, where they are said: nothing is taken for another."""
+    """Unit and frame, where stated, are those that this version reads."""
     for name, expected in field.described.items():
         if name in about and about[name] != expected:
             raise RecordingError(
@@ -114,14 +114,14 @@ def exact(place: str, key: str, raw: NDArray[Any], field: Field) -> Any:
     return raw.astype(np.float64)
 
 
-def content_hash(said: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    """SHA-256 of what is said at the root and of every data set, in the order of their paths.
+def content_hash(attributes: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    """SHA-256 of the attributes of the root and of every data set, in the order of their paths.
 
     Of values, not of bytes in a file: HDF5 and NPZ files of one run have the same.
     """
     state = hashlib.sha256()
     for key in ("schema_version", "name", "info"):
-        state.update(json.dumps([key, said.get(key)]).encode())
+        state.update(json.dumps([key, attributes.get(key)]).encode())
     for key, value in sorted(data.items()):
         if isinstance(value, tuple):
             state.update(json.dumps([key, value]).encode())

@@ -1,7 +1,7 @@
 """Files with one line for each part, such as a marker, of each frame: lines as frames, and what became of
 each part.
 
-The lines of a frame share exactly one time and stand together.
+The lines of a frame are consecutive and share one time.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ class Frames(NamedTuple):
     part: Indices
     """(n,) which part each is of."""
     names: tuple[str, ...]
-    """Of the M parts."""
+    """Names of the M parts."""
 
     def spread(self, values: Floats) -> Floats:
         """Values (lines of the file, ...) as (N, M, ...), NaN where a frame has no line of a part."""
@@ -52,7 +52,7 @@ def frames(
 ) -> tuple[Frames, Intake]:
     """The frames of a table whose lines are each of a part, and the account of its lines.
 
-    `columns` are all numbers that a line has, by which one that is repeated is told. Raises what
+    `columns` are all numbers that a line has, by which a repeated line is recognised. Raises what
     `intake.in_order` and `intake.check_rate` do.
     """
     every = stamps(table)
@@ -97,7 +97,7 @@ def part_of_each_line(
 
 
 NAMES = "printable names, without blanks at their ends, each once"
-"""What names of parts have to be: what a cell of a CSV file can hold and give back."""
+"""Requirement for names of parts: a cell of a CSV file can hold them and give them back."""
 
 
 def bad_name(names: Sequence[str]) -> int | None:

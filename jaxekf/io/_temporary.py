@@ -1,6 +1,6 @@
-"""Temporary names beside an output, what killed writers left under them, and what is safely on the disk.
+"""Temporary names beside an output, leftovers of killed writers, and writing through to the disk.
 
-``.NAME-HOST-PID-RANDOM`` tells whose it is: six hex digits of the machine's name, and the process. With
+``.NAME-HOST-PID-RANDOM`` identifies its writer: six hex digits of the machine's name, and the process. With
 ``.old`` behind it, it is what stood under the final name until a moment ago.
 """
 
@@ -20,7 +20,7 @@ _HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:6]
 _TAIL = re.compile(r"(?P<host>[0-9a-f]{6})-(?P<pid>[0-9]+)-[0-9a-f]{8}(?P<suffix>\..*)?")
 _DAY_S = 86400.0
 _NO_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EROFS)
-"""What a file system says that cannot write through; a disk that is full or broken says something else."""
+"""Errors of a file system that cannot write through; a full or broken disk has others."""
 
 
 def beside(target: Path, suffix: str = "", folder: Path | None = None) -> Path:
@@ -30,7 +30,7 @@ def beside(target: Path, suffix: str = "", folder: Path | None = None) -> Path:
 
 
 def sweep(target: Path, folder: Path | None = None) -> None:
-    """Remove what killed writers of `target` left behind; what can be neither seen nor removed stays.
+    """Remove leftovers of killed writers of `target`; leftovers that cannot be seen or removed stay.
 
     That is what has stood for a day, or whose process on this machine is gone. Where such a process took
     the old output aside and did not come to put the new one in its place, the old one is put back.

@@ -1,4 +1,4 @@
-"""Output that is written whole or not at all."""
+"""Output that is written atomically."""
 
 import math
 import os
@@ -13,7 +13,7 @@ from jaxekf._support.errors import RecordingError
 from jaxekf.io import _temporary as temporary
 
 _HEAD = 1000
-"""Bytes of a file in which its marker must stand."""
+"""Bytes at the beginning of a file that must contain its marker."""
 
 
 def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> None:
@@ -76,12 +76,12 @@ def _put_folder(made: Path, target: Path) -> None:
 
 @contextmanager
 def whole_set(path: Path | str) -> Iterator[Path]:
-    """A temporary folder whose files stand in the folder `path` when the block ends well; what else is in
-    that stays.
+    """A temporary folder whose files are moved into the folder `path` when the block ends well; what
+    else is in that stays.
 
-    Where there is no such folder, or an empty one, they come to stand there all at once. In another one
+    Where there is no such folder, or an empty one, they appear there all at once. In another one
     each replaces the file of its name, one rename after the other when all are safely written: a kill
-    between two renames leaves files of two sets, each whole, which must tell of which set they are.
+    between two renames leaves files of two sets, each whole, which must identify their set.
     """
     target = Path(path).resolve()
     fresh = not target.exists() or (target.is_dir() and not any(target.iterdir()))
@@ -141,12 +141,12 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _named(made: Path, target: Path) -> Iterator[None]:
-    """What the system says of a temporary name is told of the final one, for which it was asked."""
+    """Errors of the system about a temporary name are raised with the final name, which the user gave."""
     try:
         yield
     except OSError as error:
         named, inner = error.filename, re.search(r"errno = (\d+)", str(error))
-        if error.errno is None and inner:  # HDF5 tells of its number in words only.
+        if error.errno is None and inner:  # HDF5 has the number in its message only.
             error.errno, error.strerror = int(inner[1]), os.strerror(int(inner[1]))
         if isinstance(named, str | Path) and Path(named).is_relative_to(made):
             error.filename = str(target / Path(named).relative_to(made))

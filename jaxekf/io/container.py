@@ -61,7 +61,7 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
         entries = {
             key: export.Entry(
                 of_fixed_length(entry.value),
-                {name: of_fixed_length(said) for name, said in entry.about.items()},
+                {name: of_fixed_length(attributes) for name, attributes in entry.about.items()},
             )
             for key, entry in entries.items()
         }
@@ -76,31 +76,31 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
     The data sets that a schema needs must be there, and no unknown ones; other groups are not read. A
     type is read where no value changes by it: float32, small integers, any integer times that fit,
     never times as floats. Where ``sha256`` is there it has to be that of the content, which then is
-    taken as it is: only rows that ``valid`` (or ``visible``) says are hidden are masked, and what is
+    taken as it is: only rows hidden by ``valid`` (or ``visible``) are masked, and what is
     not finite. Without it rows are judged as those of a CSV file are (`intake`), and with `sort` put in
     order of time. `Recording.intake` has the account. Raises `RecordingError`.
     """
     path = _known(path)
     data: dict[str, Any] = {}
     with open_container(path, tuple(SCHEMAS), _ROOT) as content:
-        said = {key: content.said[key] for key in _ROOT if key in content.said}
-        _check_root(path, said)
+        attributes = {key: content.attributes[key] for key in _ROOT if key in content.attributes}
+        _check_root(path, attributes)
         for label, schema in SCHEMAS.items():
             names = {k.split("/", 1)[1] for k in content.arrays if k.startswith(f"{label}/")}
             if names:
                 layout.check_names(str(path), label, names, schema.stored)
-        _check_declared(path, content.arrays, content.said)
+        _check_declared(path, content.arrays, content.attributes)
         for key, stored in content.arrays.items():
             data[key] = layout.exact(str(path), key, stored.read(), _field(key))
-    own = "sha256" in said
-    if own and said["sha256"] != (found := layout.content_hash(said, data)):
+    own = "sha256" in attributes
+    if own and attributes["sha256"] != (found := layout.content_hash(attributes, data)):
         raise RecordingError(
             path,
             f"content whose SHA-256 is {found}",
-            f"{said['sha256']}, the attribute sha256 of the file",
+            f"{attributes['sha256']}, the attribute sha256 of the file",
             "copying the file again; after a change on purpose delete the attribute",
         )
-    recording = _assemble(path, said, data, sort=sort, own=own)
+    recording = _assemble(path, attributes, data, sort=sort, own=own)
     if not own:
         recording = without_repeats(recording)
     return _noted(recording, content.others)
@@ -119,18 +119,23 @@ def _field(key: str) -> Field:
     return SCHEMAS[label].fields[name]
 
 
-def _check_root(path: Path, said: Mapping[str, Any]) -> None:
+def _check_root(path: Path, attributes: Mapping[str, Any]) -> None:
     for key, expected in (("kind", layout.KIND), ("schema_version", SCHEMA_VERSION)):
-        if key in said and said[key] != expected:
+        if key in attributes and attributes[key] != expected:
             raise RecordingError(
-                f"{path}@{key}", f"{said[key]!r}", f"{expected!r}", "a run written for this version"
+                f"{path}@{key}",
+                f"{attributes[key]!r}",
+                f"{expected!r}",
+                "a run written for this version",
             )
     for key in ("name", "info", "sha256"):
-        if not isinstance(said.get(key, ""), str):
-            raise RecordingError(f"{path}@{key}", f"{said[key]!r}", "a text", "writing it as one")
+        if not isinstance(attributes.get(key, ""), str):
+            raise RecordingError(
+                f"{path}@{key}", f"{attributes[key]!r}", "a text", "writing it as one"
+            )
 
 
-def _check_declared(path: Path, arrays: Mapping[str, Any], said: Mapping[str, Any]) -> None:
+def _check_declared(path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
     """Types, shapes, units and frames are as documented, before any of it is read."""
     for label, schema in SCHEMAS.items():
         sizes: dict[str, int] = {}
@@ -140,12 +145,16 @@ def _check_declared(path: Path, arrays: Mapping[str, Any], said: Mapping[str, An
             field, stored = _field(key), arrays[key]
             layout.check_type(str(path), key, stored.dtype, field)
             layout.check_shape(str(path), key, stored.shape, field, sizes)
-            about = {a: str(said[f"{key}@{a}"]) for a in ("unit", "frame") if f"{key}@{a}" in said}
+            about = {
+                a: str(attributes[f"{key}@{a}"])
+                for a in ("unit", "frame")
+                if f"{key}@{a}" in attributes
+            }
             layout.check_described(str(path), key, about, field)
 
 
 def _assemble(
-    path: Path, said: Mapping[str, Any], data: Mapping[str, Any], *, sort: bool, own: bool
+    path: Path, attributes: Mapping[str, Any], data: Mapping[str, Any], *, sort: bool, own: bool
 ) -> Recording:
     """A run of arrays in their types, its rows judged."""
     streams: dict[str, Any] = {}
@@ -161,8 +170,8 @@ def _assemble(
         raise RecordingError(
             path, "no stream", f"one of the groups {', '.join(STREAMS)}", "another file"
         )
-    info = _info(path, said.get("info", ""))
-    made = Recording(str(said.get("name", path.stem)), info=info, path=path, intake=accounts)
+    info = _info(path, attributes.get("info", ""))
+    made = Recording(str(attributes.get("name", path.stem)), info=info, path=path, intake=accounts)
     return made.with_streams(streams)
 
 
@@ -207,23 +216,23 @@ def _noted(recording: Recording, others: list[str]) -> Recording:
     account = recording.intake[first]
     listed = ", ".join(sorted(others)[:10]) + (", ..." if len(others) > 10 else "")
     account = replace(
-        account, notes=(*account.notes, f"what else is in the file is not read: {listed}")
+        account, notes=(*account.notes, f"other contents of the file are not read: {listed}")
     )
     return recording.replace(intake={**recording.intake, first: account})
 
 
 def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
-    """What is written, by path; the root first."""
+    """Entries to write, by path; the root first."""
     info = dict(recording.info)
     info |= facts.known_entries(info, path)
-    said: dict[str, Any] = {
+    attributes: dict[str, Any] = {
         "kind": layout.KIND,
         "schema_version": SCHEMA_VERSION,
         "name": recording.name,
     }
     try:
-        said["info"] = tomli_w.dumps(info)
-        size = len(f"{recording.name}{said['info']}".encode())
+        attributes["info"] = tomli_w.dumps(info)
+        size = len(f"{recording.name}{attributes['info']}".encode())
     except (TypeError, ValueError, AttributeError) as error:
         raise RecordingError(
             path, f"info that is no TOML ({error})", "texts, numbers and lists", "changing it"
@@ -248,8 +257,8 @@ def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
                     layout.exact(str(path), key, raw, field), field.described
                 )
     data = {key: entry.value for key, entry in entries.items()}
-    said["sha256"] = layout.content_hash(said, data)
-    return {"": export.Entry(None, said)} | entries
+    attributes["sha256"] = layout.content_hash(attributes, data)
+    return {"": export.Entry(None, attributes)} | entries
 
 
 def _plain(value: Any) -> Any:

@@ -308,7 +308,7 @@ def parse_seconds(text: str, exponent: int = 9) -> int:
     if not value.is_finite() or value.adjusted() > 20:
         raise ValueError(text)
     value = value.scaleb(exponent).to_integral_value()
-    if abs(value) > _LARGEST_NS:
+    if not -_LARGEST_NS - 1 <= value <= _LARGEST_NS:
         raise ValueError(text)
     return int(value)
 

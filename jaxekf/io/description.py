@@ -45,7 +45,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 class Source(NamedTuple):
-    """What is said of a stream, and how it is to be read."""
+    """A stream's section of `recording.toml`, and whether its rows are sorted."""
 
     about: Mapping[str, Any]
     """Its section of `recording.toml`."""
@@ -56,7 +56,7 @@ class Source(NamedTuple):
 
 
 def check_section(file: Path, label: str, section: Any, known: Mapping[str, str]) -> None:
-    """What is said of a stream's kind and frame is what this version reads, not taken for it."""
+    """A stated kind and frame are those that this version reads."""
     if not isinstance(section, dict):
         raise RecordingError(
             file, f"{label} = {section!r}", "a section", f"[{label}]", column=label

@@ -1,7 +1,7 @@
 """An estimate as one file that other programs read: NPZ, HDF5, or a trajectory in the TUM format.
 
 NPZ and HDF5 hold the same entries by the same paths, ``outputs/attitude/value`` for instance, to the last
-bit. What is said of an entry (unit, frame, labels) is an attribute in HDF5; NPZ has no attributes, so it
+bit. Unit, frame and labels of an entry are attributes in HDF5; NPZ has no attributes, so it
 is an entry of its own there, ``outputs/attitude/value@unit``.
 """
 
@@ -20,7 +20,7 @@ from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.recordings.types import Floats, Times
 
 KIND = "jaxekf estimate"
-"""What `kind` says at the root of an NPZ or HDF5 file."""
+"""Attribute `kind` of the root of an NPZ or HDF5 file."""
 FILES = {"npz": "estimate.npz", "hdf5": "estimate.h5", "tum": "trajectory.tum"}
 """Format and name of each file that a result folder may hold besides its own."""
 _SUFFIXES = {".csv": "csv", ".npz": "npz", ".h5": "hdf5", ".hdf5": "hdf5", ".tum": "tum"}
@@ -46,7 +46,7 @@ def format_of(path: Path | str) -> str:
 
 
 def files_of(folder: Path | str, formats: Iterable[str]) -> dict[str, str]:
-    """Format and file name of what is to stand in a result folder besides its own files."""
+    """Format and file name of each export that a result folder shall have besides its own files."""
     wanted = list(dict.fromkeys(formats))
     for name in wanted:
         if name not in FILES:
@@ -64,7 +64,7 @@ def write_npz(path: Path, entries: Mapping[str, Entry]) -> None:
     arrays = {name: _array(entry.value) for name, entry in entries.items() if name}
     for name, entry in entries.items():
         head = f"{name}@" if name else ""
-        arrays |= {f"{head}{key}": _array(said) for key, said in entry.about.items()}
+        arrays |= {f"{head}{key}": _array(attribute) for key, attribute in entry.about.items()}
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)
 
@@ -79,8 +79,8 @@ def write_hdf5(path: Path, entries: Mapping[str, Entry]) -> None:
     with h5py.File(path, "w") as file:
         for name, entry in entries.items():
             node: Any = _add(file, name, entry.value) if name else file
-            for key, said in entry.about.items():
-                node.attrs[key] = said
+            for key, attribute in entry.about.items():
+                node.attrs[key] = attribute
 
 
 def _add(file: Any, name: str, value: Any) -> Any:
@@ -103,7 +103,7 @@ def write_tum(
 
     `q_ref_body` (N, 4) is w, x, y, z and `position` (N, 3) in metres, zero where there is none. Times are
     seconds with nine decimals, exact; other numbers have 17 digits, which lose nothing. Instants whose
-    pose is not finite have no line; a comment at the head tells how many.
+    pose is not finite have no line; a comment at the head has their number.
     """
     notes = ["timestamp tx ty tz qx qy qz qw (s, m, body to reference)", *comments]
     if position is None:
@@ -123,11 +123,11 @@ def write_tum(
 
 
 def read_export(path: Path | str) -> dict[str, Any]:
-    """What an NPZ or HDF5 file of `Estimate.export` holds: a dict of paths, equal for both formats.
+    """Content of an NPZ or HDF5 file of `Estimate.export`: a dict by paths, equal for both formats.
 
     Arrays have the bits that were written; single numbers are Python's, texts `str` and lists of `str`.
-    ``time_ns`` and ``state/bias`` are entries, ``state/bias@unit`` what is said of one, ``model`` what is
-    said of all. Raises `RecordingError` for a file that is none of ours.
+    ``time_ns`` and ``state/bias`` are entries, ``state/bias@unit`` an attribute of one, ``model`` an
+    attribute of the root. Raises `RecordingError` for a file that is none of ours.
     """
     form = format_of(path)
     if form not in ("npz", "hdf5"):
@@ -140,11 +140,11 @@ def read_export(path: Path | str) -> dict[str, Any]:
         raise RecordingError(
             path, f"a file that is not {form} ({error})", "an export", "exporting again"
         ) from error
-    said = (found.get("kind"), found.get("schema_version"))
-    if said != (KIND, SCHEMA_VERSION):
+    attribute = (found.get("kind"), found.get("schema_version"))
+    if attribute != (KIND, SCHEMA_VERSION):
         raise RecordingError(
             path,
-            f"kind and schema_version {said}",
+            f"kind and schema_version {attribute}",
             str((KIND, SCHEMA_VERSION)),
             "exporting again with this version",
         )
@@ -165,10 +165,10 @@ def _read_hdf5(path: Path | str) -> dict[str, Any]:
         if isinstance(node, h5py.Dataset):
             text = h5py.check_string_dtype(node.dtype) is not None
             found[name] = _plain(node.asstr()[()] if text else node[()])
-        found.update({f"{name}@{key}": _plain(said) for key, said in node.attrs.items()})
+        found.update({f"{name}@{key}": _plain(attribute) for key, attribute in node.attrs.items()})
 
     with h5py.File(path, "r") as file:
-        found |= {key: _plain(said) for key, said in file.attrs.items()}
+        found |= {key: _plain(attribute) for key, attribute in file.attrs.items()}
         file.visititems(take)
     return found
 

@@ -1,4 +1,4 @@
-"""What a recording was read from, told by content: a SHA-256 of each file."""
+"""Identity of the files that a recording was read from: a SHA-256 of each."""
 
 import hashlib
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ def hashed(folder_or_file: Path | str) -> dict[str, str]:
 
 
 def inputs(recording: Recording) -> dict[str, str]:
-    """Those of a recording: as its reader found them, else of what stands at its path now.
+    """Hashes of a recording's files: those of its reader, else of the files at its path now.
 
     Empty for a run that was made in memory.
     """

@@ -35,12 +35,12 @@ __all__ = ["SCHEMA_VERSION", "load", "load_imu", "read_log", "save"]
 def load(path: Path | str, *, sort: bool = False) -> Recording:
     """Read a recorded run. Raises `RecordingError`, which names file, line and column.
 
-    What `recording.toml` says besides becomes `Recording.info`: its own entries by their names (see
+    Further entries of `recording.toml` become `Recording.info`: its own entries by their names (see
     `facts.known_entries`), and what is left of a stream's section as ``optical_about`` and so on. Rows that
-    are not to be believed are masked and those that are none dropped: `Recording.intake` has the account.
+    must not be used are masked, and repeated rows are dropped: `Recording.intake` has the account.
     With `sort` rows that are out of order are put in order of time.
 
-    What streams say of each other must fit: units, order of quaternions, times that overlap
+    The streams must agree in units, order of quaternions and times
     (`plausible.require`); ``trust_units = true`` in `recording.toml` leaves that out.
     """
     if container.is_container(path):
@@ -102,17 +102,17 @@ def _beside(path: Path, file: str) -> Table:
 
 
 def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
-    """What ``[sha256]`` says of the files of a run, by their names."""
-    said = about.get("sha256", {})
-    if not isinstance(said, dict) or not all(isinstance(v, str) for v in said.values()):
+    """Hashes of a run's files in ``[sha256]``, by name."""
+    hashes = about.get("sha256", {})
+    if not isinstance(hashes, dict) or not all(isinstance(v, str) for v in hashes.values()):
         raise RecordingError(
             place,
-            f"sha256 = {said!r}",
+            f"sha256 = {hashes!r}",
             "a section with a hash for each file",
             "correcting or removing it",
             column="sha256",
         )
-    for name in said:
+    for name in hashes:
         if not (place.parent / name).is_file():
             raise RecordingError(
                 place,
@@ -120,7 +120,7 @@ def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
                 "one of each file",
                 "correcting its name",
             )
-    return said
+    return hashes
 
 
 def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
@@ -129,7 +129,7 @@ def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
         raise RecordingError(
             table.path,
             f"content of sha256 {table.text.sha256[:12]}...",
-            f"{expected[:12]}... as recording.toml says",
+            f"{expected[:12]}... as in recording.toml",
             "restoring the file, or removing its hash under [sha256] where it was changed on purpose",
         )
 

@@ -48,7 +48,7 @@ class Field(NamedTuple):
     about: str = ""
     """A noun phrase for the manual."""
     least: float | None = None
-    """Of a figure that the sensor reports: the smallest value that makes sense; NaN means not reported."""
+    """Smallest sensible value of a figure that the sensor reports; NaN means not reported."""
     hideable: bool = False
     """Whether cells of samples that are not valid are written blank."""
     option: str = ""
@@ -172,7 +172,7 @@ class StreamSchema:
         return (self.screen or self._plain)(place, arrays, sort)
 
     def write_table(self, stream: Any, section: dict[str, Any]) -> tuple[Sheet, dict[str, Any]]:
-        """What is written of a stream: its sheet and its section of `recording.toml`."""
+        """Sheet and section of `recording.toml` to write for a stream."""
         if self.write is not None:
             return self.write(stream, section)
         columns: list[str] = []

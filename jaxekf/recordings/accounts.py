@@ -1,4 +1,4 @@
-"""Where rows of a stream stand, and what became of them while it was read."""
+"""Places of a stream's rows in its source, and the account of used, masked and dropped rows."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ Indices = NDArray[np.intp]
 
 
 class Place(NamedTuple):
-    """Where the rows of a stream stand, for messages."""
+    """Source of a stream's rows, for messages."""
 
     path: Path | str
     """A file, or ``file.h5:imu`` for a group of data sets."""
@@ -26,7 +26,7 @@ class Place(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What the numbers count."""
+        """``line`` or ``sample``: the unit of the numbers."""
         return "sample" if self.numbers is None or self.samples else "line"
 
     def number(self, row: int) -> int:
@@ -52,7 +52,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Reason:
-    """Rows with one end."""
+    """Rows that were masked or dropped for the same reason."""
 
     numbers: Indices
     """Lines, or samples, of the rows, ascending."""
@@ -77,24 +77,24 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Intake:
-    """What became of the rows of one stream."""
+    """Account of the rows of one stream: used, masked and dropped."""
 
     rows: int
     """Rows of samples in the source."""
     masked: Mapping[str, Reason] = field(default_factory=dict)
     dropped: Mapping[str, Reason] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-    """What else was done, in sentences."""
+    """Further changes, in sentences."""
     unit: str = "line"
     numbers: Indices | None = None
     """(N,) line or sample of each sample of the stream, which may be fewer than rows."""
 
     has_status: bool = False
-    """Whether the source says of each row whether it is good."""
+    """Whether the source has a status for each row."""
     rounded: bool = False
     """Whether its numbers have so few decimals that a resting tool may repeat them."""
     parts: Mapping[str, Part] = field(default_factory=dict)
-    """Of each marker, by its name."""
+    """Accounts of the single markers, by name."""
 
     def sentences(self, label: str) -> tuple[str, ...]:
         """One warning for each reason, with count and first and last place."""
@@ -112,7 +112,7 @@ class Intake:
     def as_dict(self) -> dict[str, object]:
         """For JSON: count, first and last place by reason."""
 
-        def told(reasons: Mapping[str, Reason]) -> dict[str, object]:
+        def counts(reasons: Mapping[str, Reason]) -> dict[str, object]:
             return {
                 name: {
                     "count": reason.count,
@@ -124,8 +124,8 @@ class Intake:
 
         return {
             "rows": self.rows,
-            "masked": told(self.masked),
-            "dropped": told(self.dropped),
+            "masked": counts(self.masked),
+            "dropped": counts(self.dropped),
             "notes": list(self.notes),
             "numbers_are": f"{self.unit}s",
         }

@@ -62,7 +62,7 @@ def unit_vector(value: Any, size: int, place: Path | str, key: str) -> Floats:
 def known_entries(entries: Mapping[str, Any], place: Path | str) -> dict[str, list[float]]:
     """Those of a run's own entries whose meaning is fixed, as lists of floats.
 
-    ``gravity_ref``    [x, y, z]     free fall in the reference frame, m/s^2, not 0
+    ``gravity_ref``    [x, y, z]     gravity vector in the reference frame, m/s^2, not 0
     ``field_ref``      [x, y, z]     of the magnetic field there, of which the horizontal direction counts
     ``p_body_object``  [x, y, z]     the point of the tool that is asked for, in the body, m
     ``q_body_object``  [w, x, y, z]  from its frame to the body's, scaled to unit length

@@ -12,14 +12,15 @@ from jaxekf.recordings.screening import reasoned
 from jaxekf.recordings.types import Flags, Floats, Imu, Optical, Recording, Times
 
 _RESTING, _TURNED, _STILL = 0.05, 0.04, 0.02
-"""rad/s and rad that a gyroscope of a resting tool tells at most, and rad/s below which a tool rests."""
+"""Largest rate (rad/s) and turn (rad) of the gyroscope of a static tool, and rad/s below which it is
+static."""
 
 
 def without_repeats(recording: Recording) -> Recording:
     """A run in which poses that a tracker repeats to the last bit are masked: so looks a lost tool.
 
-    Where the gyroscope turns meanwhile the pose is frozen, whatever the status says. Where it does not, a
-    status that is good is believed, and so are numbers of four decimals or fewer, which repeat of
+    Where the gyroscope turns meanwhile the pose is frozen, whatever its status. Where it does not, a
+    good status is accepted, and so are numbers of four decimals or fewer, which repeat of
     themselves; other repeats are suspicious, and the identity at the origin from its first row on.
     """
     stream, account = recording.optical, recording.intake.get("optical")
@@ -83,7 +84,7 @@ def _turned(recording: Recording, seen: Indices, first: Indices) -> Flags:
 
 
 def _resting_rate(stream: Optical, imu: Imu, seen: Indices, first: Indices, taken: Times) -> Floats:
-    """What the gyroscope reads while the tracker says that the tool rests: its bias; else 0."""
+    """Mean reading of the gyroscope while the tracker shows a static tool, which is its bias; else 0."""
     step = max(1, int(np.searchsorted(taken, taken[0] + 500_000_000)))
     a, b = stream.q_ref_body[seen[:-step]], stream.q_ref_body[seen[step:]]
     if not len(a):

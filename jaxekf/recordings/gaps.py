@@ -1,4 +1,4 @@
-"""A run cut where its IMU has a gap: over it the motion is not known, and nothing is made up."""
+"""A run cut where its IMU has a gap: over it the motion is not known, and nothing is interpolated."""
 
 import itertools
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times, period
 LONGEST_INPUT_GAP_S = 0.1
 """An input is interpolated over shorter gaps; over longer ones the motion is not known."""
 _SHORTEST_S = 0.5
-"""What is shorter than this between two gaps is not estimated."""
+"""Shortest stretch between two gaps that is estimated."""
 
 
 def longest_ns(time_ns: Times) -> float:
@@ -35,7 +35,7 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
     at = np.flatnonzero(steps > longest_ns(time))
     if not at.size:
         return [recording], []
-    told = ", ".join(
+    listed = ", ".join(
         f"{steps[i] / NANOSECONDS:.3f} s at {time[i] / NANOSECONDS:.3f} s" for i in at[:5]
     )
     more = f" and {len(at) - 5} more" if len(at) > 5 else ""
@@ -44,7 +44,7 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
     good, bad = [], []
     for k, (begin, end) in enumerate(itertools.pairwise(edges)):
         part = _part(recording, begin, end)
-        about = f"{k + 1} of {len(edges) - 1} of '{recording.name}', cut at gaps of the IMU: {told}{more}"
+        about = f"{k + 1} of {len(edges) - 1} of '{recording.name}', cut at gaps of the IMU: {listed}{more}"
         part = part.replace(
             name=f"{recording.name}-part{k + 1}", info={**recording.info, "part": about}
         )
@@ -76,7 +76,7 @@ def _can_be_estimated(part: Recording) -> bool:
 
 
 def _part(recording: Recording, begin: int, end: int) -> Recording:
-    """What was taken from one time to another, the latter not included."""
+    """Samples taken from one time to another, the latter not included."""
     streams: dict[str, Any] = {}
     intake: dict[str, Intake] = {}
     for label, stream in recording.streams.items():

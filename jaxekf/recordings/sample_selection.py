@@ -1,4 +1,4 @@
-"""What is done to the samples of one stream before they are laid out in time: chosen, counted, held."""
+"""Selection, counting and holding of one stream's samples before they are laid out in time."""
 
 from collections.abc import Mapping
 from dataclasses import replace

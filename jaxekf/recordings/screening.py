@@ -1,8 +1,8 @@
-"""What becomes of the rows of a stream while it is read: used, masked or dropped, by reason and place.
+"""Screening of a stream's rows while it is read: used, masked or dropped, by reason and place.
 
 Whatever a stream was read from (CSV, HDF5, NPZ, another program's file), its rows are judged here, so
-that a fault has the same end everywhere. A row that is masked is there but not to be believed; one that
-is dropped is no sample at all.
+that a fault has the same result everywhere. A masked row is a sample that must not be used; a dropped
+row is no sample at all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ SLOWEST_S, SLOWEST_TRACKER_S = 0.5, 1.5
 """Median step from which on a stream is taken for one whose times are in another unit."""
 FASTEST_S = 2e-5
 _BEYOND = 1e6
-"""SI: what no sensor reads, such as the huge numbers that stand for a lost tool."""
+"""SI: beyond any sensor, such as the huge numbers that mark a lost tool."""
 STATUS_OK = ("ok", "0")
 """Words of a status that mean a good sample, unless others are stated; in lower case."""
 NDI_STATUS = {
@@ -33,7 +33,7 @@ NDI_STATUS = {
     "20": "fell behind",
     "31": "missing",
 }
-"""What numbers of NDI trackers mean."""
+"""Meaning of the status numbers of NDI trackers."""
 
 
 def optical(
@@ -49,13 +49,13 @@ def optical(
     hidden: Flags | None = None,
     also: Mapping[str, Flags] | None = None,
     sort: bool = False,
-    **said: Any,
+    **fields: Any,
 ) -> tuple[Optical, Intake]:
     """A tracker's poses (w, x, y, z, body to reference; metres; NaN where blank), bad rows masked.
 
     `status` (N,) are words of which `status_ok` (any case) mean a good row; rows whose reported fit
     `error` (N,), metres, exceeds `error_max` are masked, as are those that `hidden` (N,) names, and those
-    (N,) that an importer knows to be bad, for the reasons `also`. `said` are further fields of `Optical`.
+    (N,) that an importer knows to be bad, for the reasons `also`. `fields` are further fields of `Optical`.
     Raises `RecordingError` where no row is usable, and what `in_order`, `check_rate` and
     `judge_quaternions` do.
     """
@@ -78,7 +78,7 @@ def optical(
                 name = f"status {word}" if meaning is None else f"status {word} ({meaning})"
                 reasons[name] = words == word
     reasons |= {name: bad[order] for name, bad in (also or {}).items()}
-    # Only what is said to be good is judged as a quaternion; the rest may hold anything.
+    # Only rows with a good status are judged as quaternions; the others may hold anything.
     ignored = np.zeros(len(time_ns), bool)
     for bad in reasons.values():
         ignored |= bad
@@ -97,7 +97,7 @@ def optical(
     account = replace(
         account, notes=(*account.notes, *notes), has_status=status is not None, rounded=coarse
     )
-    return Optical(time_ns, unit, valid, position, error=error, **said), account
+    return Optical(time_ns, unit, valid, position, error=error, **fields), account
 
 
 def imu(
@@ -186,8 +186,8 @@ def judge_markers(
     """Which rows (N,), each of a marker (N,) at a position (N, 3), are of one that is seen; the others are
     masked, by reason.
 
-    `seen` (N,) is what the source itself says of each row, where it does: a position that is repeated
-    exactly is then believed, as of a tool that rests. Raises `RecordingError` where no row is left.
+    `seen` (N,) is the flag of the source for each row, where it has one: a position that is repeated
+    exactly is then accepted, as that of a static tool. Raises `RecordingError` where no row is left.
     """
     blank, finite = np.asarray(np.isnan(position).all(axis=1)), whole(position)
     reasons = {} if seen is None else {"hidden": ~seen}
@@ -221,7 +221,7 @@ def judge_points(
     """Which rows (N,), each of a landmark's image point (N, 2), are of one that was found; the others are
     masked, by reason.
 
-    `seen` (N,) is what the source itself says of each row, where it does. Raises `RecordingError` where no
+    `seen` (N,) is the flag of the source for each row, where it has one. Raises `RecordingError` where no
     row is left.
     """
     blank = np.asarray(np.isnan(pixel).all(axis=1))
@@ -326,8 +326,8 @@ def mask_first(
 def need_usable(place: Place, valid: Flags, account: Intake, what: str, hint: str) -> None:
     """Raise `RecordingError`, with the reasons, where no row (or line) is valid."""
     if not valid.any():
-        told = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
-        got = f"no usable {what} among {account.rows} ({told})"
+        reasons = ", ".join(f"{r.count} {name}" for name, r in account.masked.items())
+        got = f"no usable {what} among {account.rows} ({reasons})"
         raise place.error(None, None, got, "at least one", hint)
 
 

@@ -40,7 +40,7 @@ def encoder_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> 
 
 
 def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Floats:
-    """Body rate (N, 3), rad/s, at other times; NaN where the encoder does not tell.
+    """Body rate (N, 3), rad/s, at other times; NaN where the encoder has no value.
 
     Central differences of the encoder's attitude, interpolated linearly, neither of them over gaps
     longer than `longest_gap_s`.
@@ -52,7 +52,7 @@ def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1
 
 
 def encoder_velocity_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> Floats:
-    """Velocity (N, 3), m/s, reference frame, at other times; NaN where the encoder does not tell.
+    """Velocity (N, 3), m/s, reference frame, at other times; NaN where the encoder has no value.
 
     Central differences of the encoder's position; gaps as in `encoder_rate_at`.
     """

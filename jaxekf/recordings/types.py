@@ -29,7 +29,7 @@ STREAMS = ("optical", "markers", "camera", "imu", "encoder")
 
 @dataclass(frozen=True)
 class Samples:
-    """What one sensor or input of a model reads from a recording.
+    """Samples of one sensor or input of a model, read from a recording.
 
     Each sample holds the value at its own time (the end of the interval since the sample before).
     """
@@ -46,7 +46,7 @@ class Samples:
     origin: tuple[str, ...] = ()
     """The recording's stream that it is of, and of which part of it, such as a marker: for the account."""
     thinned: int = 0
-    """Samples of that stream that are left out here because so many tell nothing more."""
+    """Samples of that stream that are left out here because they add no information."""
     points: Times | None = None
     """(N,) where a sample is made of like groups, such as the points of an image: how many of them the
     source has; the account counts these. None where a sample is one row of the source."""
@@ -187,7 +187,7 @@ class Markers(_Stream):
 
 @dataclass(frozen=True)
 class Camera(_Stream):
-    """Where landmarks of known places appear in the images of a camera that is fixed to the body."""
+    """Image points of landmarks whose positions are known, from a camera that is fixed to the body."""
 
     time_ns: Times
     """Stamps of the images; an image was taken `latency_ns` before."""
@@ -293,21 +293,22 @@ class Encoder(_Stream):
 
 @dataclass(frozen=True)
 class Recording:
-    """One run: its streams, and what its description says besides."""
+    """One run: its streams, and the further entries of its description."""
 
     name: str
     optical: Optical | None = None
     imu: Imu | None = None
     encoder: Encoder | None = None
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Facts: ``gravity_ref`` (free fall, m/s^2, reference frame), ``field_ref`` (magnetic north there),
+    """Facts: ``gravity_ref`` (gravity vector, m/s^2, reference frame), ``field_ref`` (magnetic north
+    there),
     ``p_body_object`` and
     ``q_body_object`` (the point and frame of the tool that is asked for), licence, seed."""
     path: Path | None = None
     markers: Markers | None = None
     camera: Camera | None = None
     intake: Mapping[str, Intake] = field(default_factory=dict)
-    """What became of the rows of each stream's source while it was read; empty of a run made in memory."""
+    """Account of the rows of each stream's source; empty for a run made in memory."""
     sources: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each file it was read from, by name; empty for an importer that reports none."""
     others: Mapping[str, PlainStream] = field(default_factory=dict)

@@ -50,11 +50,11 @@ def _read(table: Table, source: description.Source, landmarks: Table) -> tuple[C
 
     Points of landmarks that were not found are NaN, as are deviations that were not reported. Raises
     `RecordingError` for a landmark without a place or twice in an image, for times that decrease, for what
-    is not a finite number, and for a camera of which too little is said.
+    is not a finite number, and for a missing focal length or centre.
     """
     about, place = source.about, source.place
     length, _ = stream_options.factors("camera", ("m", "px"), about, place)
-    said = _optics(about, place, "camera.")
+    optics = _optics(about, place, "camera.")
     names, p_ref_landmark = _places(landmarks, length)
     pixel, sigma = numbers(table, ("u", "v"), blank=True), reported(table, "sigma")
     _check_sigma(table.place, sigma)
@@ -81,7 +81,7 @@ def _read(table: Table, source: description.Source, landmarks: Table) -> tuple[C
         p_ref_landmark,
         sigma=None if sigma is None else made.spread(sigma),
         latency_ns=description.latency_ns(about, "camera", place),
-        **said,
+        **optics,
     )
     return stream, account
 
@@ -107,9 +107,9 @@ def _write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]
     if stream.sigma is not None:
         columns.append("sigma")
         values.append(stream.sigma.reshape(-1, 1))
-    said = {key: getattr(stream, key) for key in _OPTICS}
+    entries = {key: getattr(stream, key) for key in _OPTICS}
     about |= {**SCHEMA.described} | description.latency_entry(stream.latency_ns)
-    about |= {key: value.tolist() for key, value in _optics(said, facts.FILE, "camera.").items()}
+    about |= {key: value.tolist() for key, value in _optics(entries, facts.FILE, "camera.").items()}
     images, count = seen.shape
     times = np.repeat(stream.time_ns, count)
     return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * images), about
@@ -125,15 +125,15 @@ def _write_landmarks(stream: Camera, path: Path) -> None:
             writer.writerow([name, *(f"{value:.17g}" for value in point)])
 
 
-def _optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[str, Floats]:
-    """Fields of `Camera` that say what it is and where it sits, where they are said.
+def _optics(entries: Mapping[str, Any], place: Path | str, head: str = "") -> dict[str, Floats]:
+    """Fields of `Camera` that describe lens and mounting, as far as `entries` has them.
 
     Raises `RecordingError`, which names the entry with `head` before it, for a focal length or centre that
-    is not said or none, and a quaternion of zeros; others are scaled to unit length.
+    is missing or invalid, and a quaternion of zeros; others are scaled to unit length.
     """
     found = {}
     for key in ("focal", "centre"):
-        if key not in said:
+        if key not in entries:
             raise RecordingError(
                 place,
                 f"no {head}{key}",
@@ -141,7 +141,7 @@ def _optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[
                 f"adding {key} = [{key[0]}x, {key[0]}y] under [camera]",
                 column=f"{head}{key}",
             )
-        found[key] = facts.finite_vector(said[key], 2, place, f"{head}{key}")
+        found[key] = facts.finite_vector(entries[key], 2, place, f"{head}{key}")
     if (found["focal"] <= 0.0).any():
         raise RecordingError(
             place,
@@ -151,11 +151,11 @@ def _optics(said: Mapping[str, Any], place: Path | str, head: str = "") -> dict[
             column=f"{head}focal",
         )
     for key, size in (("radial", 2), ("p_body_camera", 3)):
-        if key in said:
-            found[key] = facts.finite_vector(said[key], size, place, f"{head}{key}")
-    if "q_body_camera" in said:
+        if key in entries:
+            found[key] = facts.finite_vector(entries[key], size, place, f"{head}{key}")
+    if "q_body_camera" in entries:
         key = "q_body_camera"
-        found[key] = facts.unit_vector(said[key], 4, place, f"{head}{key}")
+        found[key] = facts.unit_vector(entries[key], 4, place, f"{head}{key}")
     return found
 
 

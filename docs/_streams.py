@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxekf.io._stream_options import COMMON
+from jaxekf.io._stream_options import COMMON, UNITS
 from jaxekf.io.schema import StreamSchema
 from jaxekf.io.streams import SCHEMAS
 from jaxekf.recordings.types import STREAMS
@@ -20,6 +20,12 @@ def _code(text: str) -> str:
     return f"`{text}`" if text else ""
 
 
+def _units(unit: str) -> str:
+    """A unit, and in brackets those that a CSV file may have instead."""
+    others = [other for other in UNITS.get(unit, {}) if other != unit]
+    return f"{unit} ({', '.join(others)})" if others else unit
+
+
 def _section(schema: StreamSchema) -> list[str]:
     """One stream: files, arrays and entries of its section."""
     headers = " or ".join(_code(layout) for layout in schema.layouts)
@@ -31,7 +37,7 @@ def _section(schema: StreamSchema) -> list[str]:
             _code(name),
             _code(",".join(one.columns)),
             "(" + ", ".join(map(str, one.shape)) + ")" if one.shape else "",
-            one.unit,
+            _units(one.unit),
             one.frame,
             ("yes" if one.needed else "") if one.stored else "CSV only",
             one.about,

@@ -1,7 +1,7 @@
-"""What the tuner minimises, as one differentiable number over all runs at once."""
+"""Objectives of the tuner: one differentiable number over all runs at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -38,8 +38,8 @@ class Objective:
     truth: float = 0.0
     """Weight of the likelihood of the true attitude under the estimate."""
     prior: float = 0.0
-    """Weight of the prior (see `Free.prior`), which counts as so many more rows: 1 with a likelihood of 1
-    gives the most probable parameters."""
+    """Weight of the prior (see `Free.prior`), as a number of rows: 1 with a likelihood of 1 gives the most
+    probable parameters."""
     smoothed: bool = False
     """Whether errors are those of the smoothed estimate."""
 
@@ -116,7 +116,7 @@ def innovation_likelihood() -> Objective:
 
 
 def truth_likelihood() -> Objective:
-    """Negative log-likelihood of the true attitude under the estimate: error and honesty in one."""
+    """Negative log-likelihood of the true attitude under the estimate: error and consistency in one."""
     return Objective(truth=1.0)
 
 
@@ -154,6 +154,13 @@ def parse(text: str) -> Objective:
                 f" {sorted(NAMED)}; for instance attitude+0.1*likelihood"
             ) from None
     return total
+
+
+def as_objective(given: Objective | str | None, *, smooth: bool = False) -> Objective:
+    """An objective from itself or its text, the attitude error unless given; of the smoothed estimate with
+    `smooth`."""
+    aim = parse(given) if isinstance(given, str) else given or attitude_error()
+    return replace(aim, smoothed=smooth or aim.smoothed)
 
 
 def shared(params: Parameters, data: Data) -> Parameters:
@@ -197,7 +204,7 @@ def evaluate(
 ) -> Array:
     """The objective of all runs with the same parameters, a scalar with a gradient to each of them.
 
-    Samples of all runs are pooled, so that a longer run weighs more. Where `data` is one group of several,
+    Samples of all runs are pooled, so that a longer run weighs more. If `data` is one group of several,
     `counts` are those of `count` over all groups: the values of the groups then add up to that of all.
     """
     return evaluate_each(model, objective, shared(params, data), data, counts)
@@ -229,9 +236,9 @@ def weights_of(objective: Objective) -> dict[str, float]:
 
 
 def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
-    """What each term is the mean over: judged instants, and for the likelihood visible rows.
+    """Number of samples that each term is the mean over: judged instants, visible rows for the likelihood.
 
-    Of NumPy arrays (`tuning.objective.data.on_host`) it compiles nothing.
+    With NumPy arrays (`tuning.objective.data.on_host`) nothing is compiled.
     """
     found = {}
     for name in names:
@@ -266,7 +273,7 @@ def terms_each(
 ) -> dict[str, Array]:
     """Single terms of an objective, unweighted, from one run of the filter.
 
-    An output's name stands for its mean squared error, ``likelihood`` for the negative mean log-likelihood
+    An output's name is its mean squared error, ``likelihood`` for the negative mean log-likelihood
     of a measured row, ``truth`` for that of the true attitude under the estimate. `counts` is as in
     `evaluate`.
     """
@@ -305,7 +312,7 @@ def _truth_unlikelihood(
 def error_and_covariance(
     model: Model, every: Parameters, output: ekf.FilterOutput, data: Data
 ) -> tuple[Array, Array]:
-    """Attitude errors (runs, K, S, 3) and their covariances; the identity where nothing is judged."""
+    """Attitude errors (runs, K, S, 3) and their covariances; the identity at other instants."""
     error = output_error(model, every, output, data, "attitude")
     _, cov = evaluate_outputs(model, every, output)["attitude"]
     judged = data.truth["attitude"].judged

@@ -1,4 +1,4 @@
-"""What is free, from a short TOML file."""
+"""Free parameters from a TOML file."""
 
 import tomllib
 from pathlib import Path

@@ -265,7 +265,7 @@ def test_what_the_tuner_says_is_understood(short, tmp_path):
     assert told["rows"] == [] and told["judged_on"] is None and told["folds"] is None
     assert [n["left_open"] for n in told["numbers"]] == [False] * len(told["numbers"])
     assert told["warnings"][0].startswith(
-        "No run was held out: the tuning was judged by the training"
+        "No run was held out: the tuning was validated on the training"
     )
     assert told["warnings"][1] == f"The search did not converge: {short.stopped}; ask for more"
     stopped = replace(short, stopped="interrupted; the best so far is kept")
@@ -312,7 +312,9 @@ def worse_fold(document):
         (lambda d: None, []),
         (
             opened,
-            ["leave noise.optical open, so that it stays at its start: turning about two axes"],
+            [
+                "not determine noise.optical, so that it keeps its initial value: turning about two axes"
+            ],
         ),
         (change(0, change=9.9), []),
         (change(0, change=10.1), ["noise.optical moved by more than a factor of 10"]),

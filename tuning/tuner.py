@@ -107,21 +107,21 @@ def tune(
         If the problem is ill-posed; bad data raise as in `estimate`.
     """
     require_float64()
-    learnt, judging = read(runs), read(validate)
+    learnt, validation = read(runs), read(validate)
     method = as_optimiser(optimiser, batch)
     aim = as_objective(objective, smooth=smooth)
-    problem = _problem(learnt, judging, model, aim, free, start, axes, burn_in_s)
+    problem = _problem(learnt, validation, model, aim, free, start, axes, burn_in_s)
     make = partial(method.search, *problem, iterations, starts=starts, seed=seed)
     searches = start_searches(make, starts, seed)
     if checkpoint is not None:
         limits = iterations, patience, burn_in_s, confidence_intervals, warm
-        options = _names(learnt), _names(judging), *limits, method, starts, seed
+        options = _names(learnt), _names(validation), *limits, method, starts, seed
         attach(searches, Path(checkpoint), repr(options))
     if warm:
         searches.warm(_WARM_STEPS)
     search = searches.run(patience, progress)
     known, stopped = _finish(search, patience, confidence_intervals, progress)
-    tuned = _tuned(searches, search, known, stopped, learnt, judging, rescale)
+    tuned = _tuned(searches, search, known, stopped, learnt, validation, rescale)
     if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
     return tuned
@@ -129,7 +129,7 @@ def tune(
 
 def _problem(
     learnt: list[Recording],
-    judging: list[Recording],
+    validation: list[Recording],
     model: str | Model,
     aim: Objective,
     free: Sequence[str | Free] | None,
@@ -138,12 +138,12 @@ def _problem(
     burn_in_s: float,
 ) -> tuple[Any, ...]:
     """The first six fields of a `Descent`."""
-    chosen = adapted(get_model(model), [*learnt, *judging])
+    chosen = adapted(get_model(model), [*learnt, *validation])
     base = initial_parameters(chosen, start, free, axes)
     where = layout(chosen, base, free, len(learnt))
-    _check(learnt, judging, where, aim)
+    _check(learnt, validation, where, aim)
     groups = partial(prepare_groups, chosen, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
-    return chosen, aim, where, base, groups(learnt), groups(judging) if judging else None
+    return chosen, aim, where, base, groups(learnt), groups(validation) if validation else None
 
 
 def _finish(
@@ -172,7 +172,7 @@ def _tuned(
     known: Information | None,
     stopped: str,
     learnt: list[Recording],
-    judging: list[Recording],
+    validation: list[Recording],
     rescale: bool | None,
 ) -> Tuned:
     """Result of a finished search."""
@@ -189,7 +189,7 @@ def _tuned(
     each = {name: where.one_run(params, i) for i, name in enumerate(runs)} if where.own else {}
     origin = {
         "runs": runs,
-        "validation_runs": _names(judging),
+        "validation_runs": _names(validation),
         "objective": search.objective.describe(),
         "free": [leaf.name for leaf in where.leaves],
         "iterations": len(search.history),
@@ -203,7 +203,7 @@ def _tuned(
         origin["own_of_each_run"] = sorted(where.own)
     if search.fixed.any():
         origin["left_open"] = [where.labels()[i] for i in np.flatnonzero(search.fixed)]
-    if judging:
+    if validation:
         origin["validation_value"] = best.validation
     return Tuned(
         model=search.model,
@@ -224,7 +224,7 @@ def _tuned(
         evaluations=searches.evaluations,
         filterings=searches.filterings + rescale,
         starts=searches.outcomes if len(searches.searches) > 1 else (),
-        inputs=dict(inputs_of([*learnt, *judging])),
+        inputs=dict(inputs_of([*learnt, *validation])),
     )
 
 

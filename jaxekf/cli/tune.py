@@ -221,14 +221,14 @@ def tune(
     start = parameters.load(chosen, *noise_files)
     aim = parse(objective)
     training = load_runs(runs, sort=sort, model=chosen)
-    judging = load_runs(validate, sort=sort, model=chosen)
+    validation = load_runs(validate, sort=sort, model=chosen)
     chosen_free = [*free, *(read_free(spec) if spec else ())]
     chosen_free += [tuning.Free(name, each_run=True) for name in own]
-    for run in training + judging if aim.needs_truth else ():
+    for run in training + validation if aim.needs_truth else ():
         if run.encoder is None:
             note(f"run '{run.name}' has no encoder and does not count in the error")
     options: dict[str, Any] = {
-        "validate": judging,
+        "validate": validation,
         "model": chosen,
         "objective": aim,
         "free": chosen_free or None,
@@ -257,8 +257,8 @@ def tune(
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
         tuning.forget_folds(state)
     _note(tuned, output)
-    scored = [run for run in judging or training if run.encoder is not None]
-    theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if judging else {}
+    scored = [run for run in validation or training if run.encoder is not None]
+    theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if validation else {}
     rows = _compare(tuned, scored, start, theirs, smooth) if scored else []
     tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
@@ -267,16 +267,16 @@ def tune(
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
-    _print(tuned, rows, "validation runs" if judging else "the training runs")
+    _print(tuned, rows, "validation runs" if validation else "the training runs")
 
 
-def _print(tuned: tuning.Tuned, rows: list[tuning.Row], judged: str) -> None:
+def _print(tuned: tuning.Tuned, rows: list[tuning.Row], runs: str) -> None:
     """The tables of a tuning."""
     _print_noise(tuned)
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        print_comparison(f"On {judged}", rows)
+        print_comparison(f"On {runs}", rows)
 
 
 def _note(tuned: tuning.Tuned, output: Path) -> None:

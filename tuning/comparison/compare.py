@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
-from jaxekf.estimation.batch import Run, estimate_many
+from jaxekf.estimation.batch import Run, estimate_many, read
 from jaxekf.estimation.result import Estimate, trackers
 from jaxekf.evaluation.metrics import score, score_hold_last, score_raw_rate
 from jaxekf.filtering.model import Model, Parameters
-from jaxekf.io import run_folder
 from jaxekf.recordings.types import Recording
 from tuning.results.comparison import Comparison, Row
 
@@ -37,7 +36,7 @@ def compare(
         Its rows begin, for each run with a tracker, with `hold last`: the last tracker sample, and the
         gyroscope as rate. That has no covariance, so that NIS and NEES are NaN.
     """
-    recordings = [run if isinstance(run, Recording) else run_folder.load(run) for run in runs]
+    recordings = read(runs)
     estimates = {
         name: estimate_many(recordings, model, p, smooth=smooth) for name, p in variants.items()
     }
@@ -57,17 +56,17 @@ def compare_estimates(
             raw = nan if recording.imu is None else score_raw_rate(recording)
             rows.append(Row(recording.name, "hold last", held, raw, nan, nan))
         for name, made in estimates.items():
-            judged = score(made[i], recording)
+            scores = score(made[i], recording)
             rows.append(
                 Row(
                     recording.name,
                     name,
-                    judged.attitude_rmse_deg,
-                    judged.rate_rmse_deg_s,
+                    scores.attitude_rmse_deg,
+                    scores.rate_rmse_deg_s,
                     _tracker_nis(made[i]),
-                    judged.attitude_nees,
-                    judged.position_rmse_mm,
-                    judged.position_nees,
+                    scores.attitude_nees,
+                    scores.position_rmse_mm,
+                    scores.position_nees,
                 )
             )
     made = {name: list(every) for name, every in estimates.items()}

@@ -93,13 +93,13 @@ def cross_validate(
         For less than two folds, more folds than runs with an encoder, two runs of one name, files of
         another cross-validation, ``allan`` if no run rests, and as in `tune`.
     """
-    recordings, judging = read(runs), read(validate)
-    chosen = adapted(get_model(model), [*recordings, *judging])
-    parts, others = _parts(recordings, judging, folds), ordered(baselines)
+    recordings, validation = read(runs), read(validate)
+    chosen = adapted(get_model(model), [*recordings, *validation])
+    parts, others = _parts(recordings, validation, folds), ordered(baselines)
     before = chosen.parameters if start is None else start
     optimiser = as_optimiser(options.pop("optimiser", LBFGS()), options.pop("batch", None))
     options |= {"start": start, "burn_in_s": burn_in_s, "smooth": smooth, "optimiser": optimiser}
-    task = _Task(chosen, judging, options, checkpoint, limits, static, stage, len(parts))
+    task = _Task(chosen, validation, options, checkpoint, limits, static, stage, len(parts))
     done: list[Fold] = []
     of_run: dict[str, dict[str, Parameters]] = {name: {} for name in (*others, "tuned")}
     cost = float("nan")
@@ -127,7 +127,7 @@ class _Task:
     """Arguments that all folds share."""
 
     model: Model
-    judging: list[Recording]
+    validation: list[Recording]
     options: dict[str, Any]
     checkpoint: Path | str | None
     limits: Limits
@@ -157,7 +157,7 @@ class _Task:
         tuned: list[Tuned] = []
 
         def search() -> dict[str, Any]:
-            given = {"model": self.model, "validate": self.judging, "checkpoint": parts.running}
+            given = {"model": self.model, "validate": self.validation, "checkpoint": parts.running}
             tuned.append(tune(seen, **given, **self.options))
             if "interrupted" in tuned[0].stopped:
                 raise KeyboardInterrupt
@@ -165,7 +165,7 @@ class _Task:
 
         arrays = parts.once("tuned", search)
         if not tuned:
-            model = adapted(self.model, [*seen, *self.judging])
+            model = adapted(self.model, [*seen, *self.validation])
             tuned.append(unpack_tuned(arrays, model, problem, [run.name for run in seen]))
         return Fold((), tuned[0], found), problem
 
@@ -179,24 +179,24 @@ class _Task:
         plain = {k: v for k, v in self.options.items() if k not in ("progress", "start")}
         options = (
             [run.name for run in seen],
-            [run.name for run in self.judging],
+            [run.name for run in self.validation],
             sorted(plain.items()),
             self.limits,
         )
         validation = None
-        if self.judging:
-            model = adapted(self.model, [*seen, *self.judging])
+        if self.validation:
+            model = adapted(self.model, [*seen, *self.validation])
             validation = prepare_groups(
-                model, self.judging, burn_in_s=self.options["burn_in_s"], need_truth=False
+                model, self.validation, burn_in_s=self.options["burn_in_s"], need_truth=False
             )
         return digest(problem.evaluation, repr(options), validation)
 
 
 def _parts(
-    recordings: Sequence[Recording], judging: Sequence[Recording], folds: int | None
+    recordings: Sequence[Recording], validation: Sequence[Recording], folds: int | None
 ) -> list[list[str]]:
     """Names of the runs that each fold holds out."""
-    names = [run.name for run in [*recordings, *judging]]
+    names = [run.name for run in [*recordings, *validation]]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise TuningError(

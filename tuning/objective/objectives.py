@@ -19,6 +19,7 @@ from jaxekf.geometry import manifold
 from tuning.objective.data import Data
 from tuning.parametrisation.truth_frame import TruthFrame, corrected
 
+_WEIGHTS = ("likelihood", "truth", "prior")
 _DEGREES_SQUARED = float(np.rad2deg(1.0) ** 2)
 
 
@@ -27,9 +28,8 @@ class Objective:
     """A weighted sum of mean squared errors against truth and of innovation likelihood.
 
     ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``, and the
-    likelihood of the truth and a prior where they have a weight; attitude
-    errors are geodesic angles in degrees, rate errors in deg/s, position errors in mm. Add two objectives
-    to combine them.
+    weighted likelihood of the truth and prior. Attitude errors are geodesic angles in degrees, rate errors
+    in deg/s, position errors in mm. Add two objectives to combine them.
     """
 
     errors: tuple[tuple[str, float], ...] = ()
@@ -53,23 +53,14 @@ class Objective:
             )
 
     def __add__(self, other: "Objective") -> "Objective":
-        return Objective(
-            self.errors + other.errors,
-            self.likelihood + other.likelihood,
-            self.truth + other.truth,
-            self.prior + other.prior,
-            self.smoothed or other.smoothed,
-        )
+        sums = {name: getattr(self, name) + getattr(other, name) for name in _WEIGHTS}
+        smoothed = self.smoothed or other.smoothed
+        return Objective(self.errors + other.errors, **sums, smoothed=smoothed)
 
     def __mul__(self, factor: float) -> "Objective":
         scaled = tuple((name, weight * factor) for name, weight in self.errors)
-        return Objective(
-            scaled,
-            self.likelihood * factor,
-            self.truth * factor,
-            self.prior * factor,
-            self.smoothed,
-        )
+        weights = {name: getattr(self, name) * factor for name in _WEIGHTS}
+        return replace(self, errors=scaled, **weights)
 
     __rmul__ = __mul__
 
@@ -228,11 +219,8 @@ def weights_of(objective: Objective) -> dict[str, float]:
     weights: dict[str, float] = {}
     for name, weight in objective.errors:
         weights[name] = weights.get(name, 0.0) + weight
-    if objective.likelihood:
-        weights["likelihood"] = objective.likelihood
-    if objective.truth:
-        weights["truth"] = objective.truth
-    return weights
+    others = {"likelihood": objective.likelihood, "truth": objective.truth}
+    return weights | {name: weight for name, weight in others.items() if weight}
 
 
 def count(data: Data, names: Sequence[str]) -> dict[str, Array]:

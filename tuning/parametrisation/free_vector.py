@@ -210,8 +210,7 @@ class Layout:
 
     def for_runs_number(self, runs: int) -> "Layout":
         """The layout for another number of runs."""
-        leaves = (replace(leaf, runs=runs if leaf.runs else 0) for leaf in self.leaves)
-        return Layout(tuple(leaves))
+        return Layout(tuple(replace(leaf, runs=runs if leaf.runs else 0) for leaf in self.leaves))
 
     def index(self, place: Any) -> Any:
         """(runs, m) indices of each run's numbers in the free vector, ordered as in `of_one_run`."""
@@ -306,30 +305,30 @@ def layout(
             "got nothing that is free, expected some parameters; name noise, for example"
         )
     chosen: dict[str, Free] = {}
-    for entry in wanted:
-        asked = entry if isinstance(entry, Free) else Free(entry)
-        found = [n for n in units if n == asked.name or n.startswith(f"{asked.name}.")]
+    for given in wanted:
+        entry = given if isinstance(given, Free) else Free(given)
+        found = [n for n in units if n == entry.name or n.startswith(f"{entry.name}.")]
         if not found:
             raise TuningError(
-                f"got the free parameter '{asked.name}', expected some of {list(units)};"
+                f"got the free parameter '{entry.name}', expected some of {list(units)};"
                 " check the spelling"
             )
-        chosen |= dict.fromkeys(found, asked)
+        chosen |= dict.fromkeys(found, entry)
     return Layout(
         tuple(
-            _leaf(name, np.asarray(values[name]), units[name], asked, runs)
-            for name, asked in chosen.items()
+            _leaf(name, np.asarray(values[name]), units[name], entry, runs)
+            for name, entry in chosen.items()
         )
     )
 
 
-def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
+def _leaf(name: str, value: Any, unit: str, entry: Free, runs: int) -> Leaf:
     linear = name.startswith(("calibration.", "truth."))
     step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
     if not linear:
         _check_positive(name, value)
     kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
-    prior = asked.prior
+    prior = entry.prior
     if prior is None:
         prior = _WEAK.get(unit, step) if linear else _WEAK_LOG
     if not 0.0 < prior < np.inf:
@@ -337,19 +336,19 @@ def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
             " for a weak one"
         )
-    leaf = Leaf(name, value.shape, kind, step, runs if asked.each_run else 0, prior / step)
-    bounds = _bounds(name, value, kind, step, asked.bounds)
+    leaf = Leaf(name, value.shape, kind, step, runs if entry.each_run else 0, prior / step)
+    bounds = _bounds(name, value, kind, step, entry.bounds)
     if bounds is None:
         return leaf
     numbers = replace(leaf, runs=0).to_free(jnp.asarray(value))
     return replace(leaf, bounds=bounds, middle=tuple(np.asarray(numbers).tolist()))
 
 
-def _bounds(name: str, value: Any, kind: str, step: float, asked: Any) -> Any:
+def _bounds(name: str, value: Any, kind: str, step: float, given: Any) -> Any:
     """Bounds of the free numbers."""
-    if asked is None:
+    if given is None:
         return None
-    low, high = (float(bound) for bound in asked)
+    low, high = (float(bound) for bound in given)
     if not (np.all(low < value) and np.all(value < high)) or kind == "factor":
         got = "a full matrix" if kind == "factor" else f"a start of {value.tolist()}"
         raise TuningError(

@@ -18,6 +18,18 @@ from tuning.search.derivative_free import Problem
 
 _SUFFIX = ".fold"
 _RUNNING = ".running"
+_PLAIN = (
+    "best",
+    "history",
+    "stopped",
+    "scale",
+    "origin",
+    "evaluations",
+    "filterings",
+    "starts",
+    "inputs",
+)
+"""Parts of `Tuned` that are kept as JSON."""
 
 
 class FoldCheckpoint:
@@ -84,19 +96,8 @@ def unpack_found(state: Mapping[str, Any], problem: Problem) -> Searched:
 
 def pack_tuned(tuned: Tuned) -> dict[str, Any]:
     """A tuning as arrays, without the parts that follow from runs and options."""
-    found: dict[str, Any] = {
-        "best": np.array(tuned.best, float),
-        "history": np.array(tuned.history, float),
-        "stopped": tuned.stopped,
-        "scale": tuned.scale,
-        "origin": json.dumps(tuned.origin),
-        "inputs": json.dumps(tuned.inputs),
-        "free": tuned.free,
-        "fixed": tuned.fixed,
-        "evaluations": tuned.evaluations,
-        "filterings": tuned.filterings,
-        "starts": json.dumps([one._asdict() for one in tuned.starts]),
-    }
+    plain = {name: getattr(tuned, name) for name in _PLAIN}
+    found: dict[str, Any] = {"plain": json.dumps(plain), "free": tuned.free, "fixed": tuned.fixed}
     trees: dict[str, Any] = {"params": tuned.params, "truth": tuned.truth}
     trees |= {f"each{i}": params for i, params in enumerate(tuned.each.values())}
     for name, tree in trees.items():
@@ -118,33 +119,24 @@ def unpack_tuned(
         leaves = [jnp.asarray(state[f"{name}.{i}"]) for i in range(count)]
         return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
-    plain: Parameters = base._replace(truth=())
+    own: Parameters = base._replace(truth=())
     known = None
     if "matrix" in state:
         known = Information(where, state["known.free"], state["matrix"], state["score"])
+    plain = json.loads(str(state["plain"]))
+    plain["best"] = Iteration(*plain["best"])
+    plain["history"] = tuple(Iteration(*step) for step in plain["history"])
+    plain["starts"] = tuple(Outcome(*one) for one in plain["starts"])
     return Tuned(
         model=model,
-        params=tree("params", plain),
+        params=tree("params", own),
         start=base,
         objective=problem.evaluation.objective,
-        best=_iteration(state["best"]),
-        history=tuple(map(_iteration, state["history"])),
-        stopped=str(state["stopped"]),
-        scale=float(state["scale"]),
         layout=where,
-        origin=json.loads(str(state["origin"])),
-        each={name: tree(f"each{i}", plain) for i, name in enumerate(runs)} if where.own else {},
+        each={name: tree(f"each{i}", own) for i, name in enumerate(runs)} if where.own else {},
         truth=tree("truth", base.truth) if base.truth else None,
         free=state["free"],
         information=known,
         fixed=state["fixed"],
-        evaluations=int(state["evaluations"]),
-        filterings=float(state["filterings"]),
-        starts=tuple(Outcome(**one) for one in json.loads(str(state["starts"]))),
-        inputs=json.loads(str(state["inputs"])),
+        **plain,
     )
-
-
-def _iteration(row: Any) -> Iteration:
-    number, training, validation, rejected = row
-    return Iteration(int(number), float(training), float(validation), bool(rejected))

@@ -115,14 +115,13 @@ def _with_batch(optimiser: Optimiser, batch: int | None) -> Optimiser:
 def as_optimiser(
     given: Optimiser | optax.GradientTransformation | str, batch: int | None = None
 ) -> Optimiser:
-    """An optimiser from one of optax, or from a deprecated name and batch."""
+    """An optimiser from one of optax, or from a deprecated name and batch of `tuning.tune`."""
     if isinstance(given, str):
-        optimiser = from_name(given)
-        warn_renamed(f"optimiser={given!r}", f"optimiser=tuning.{optimiser}", stacklevel=3)
-    elif isinstance(given, optax.GradientTransformation):
-        optimiser = _Optax(given)
-    else:
-        optimiser = given
+        optimiser = from_name(given, batch)
+        warn_renamed(f"optimiser={given!r}", f"optimiser=tuning.{optimiser}", stacklevel=4)
+        return optimiser
     if batch is not None:
-        warn_renamed("batch", f"optimiser=tuning.Adam(batch={batch})", stacklevel=3)
-    return _with_batch(optimiser, batch)
+        warn_renamed("batch", f"optimiser=tuning.Adam(batch={batch})", stacklevel=4)
+    return _with_batch(
+        _Optax(given) if isinstance(given, optax.GradientTransformation) else given, batch
+    )

@@ -112,6 +112,11 @@ _NAMES = {
     "jaxekf.datasets": {"demo": "jaxekf.simulation:demo"},
     "jaxekf.static_noise": {"read_log": "jaxekf.io.run_folder:read_log"},
     "tuning.descent": {"total_counts": "tuning.search.evaluation:total_counts"},
+    "tuning.beside": {"BESIDE": "tuning.comparison.baselines:BASELINES"},
+    "tuning.folds": {
+        name: f"tuning.results.held_out:{name}" for name in ("ParameterSpread", "Spread")
+    },
+    "tuning.work": {"Work": "tuning.results.held_out:Work"},
     "tuning.fitted": {"Fit": "tuning.results.fitted:FittedParameters"},
     "tuning.validation": {
         name: f"tuning.results.comparison:{name}" for name in ("as_dicts", "mean_by_variant")

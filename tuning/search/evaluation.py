@@ -122,10 +122,8 @@ class Evaluation:
     def value(self, free: Any) -> float:
         """Objective of the training runs: one filtering of all of them."""
         plain = on_host(free)
-        return (
-            self._sum(self.training, self.training_counts, self.layout, plain)
-            + (self.prior(plain)[0])
-        )
+        value = self._sum(self.training, self.training_counts, self.layout, plain)
+        return value + self.prior(plain)[0]
 
     def _sum(self, groups: Sequence[Data], counts: Any, where: Layout, free: Floats) -> float:
         given = self.model, self.objective, where, free, self.base

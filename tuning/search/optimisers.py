@@ -13,7 +13,7 @@ from tuning.search.descent import Descent
 
 
 class Optimiser(Protocol):
-    """An optimiser for `tuning.tune`."""
+    """An optimiser for `tuning.tune`; checkpoints know it by its `repr`."""
 
     def search(self, *problem: Any, starts: int, seed: int) -> Descent:
         """Search from the start of a problem, the first seven fields of `Descent`.

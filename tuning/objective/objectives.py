@@ -96,40 +96,21 @@ def rate_error() -> Objective:
     return Objective((("rate", 1.0),))
 
 
-def position_error() -> Objective:
-    """Mean squared position error, mm^2."""
-    return Objective((("position", 1.0),))
-
-
 def innovation_likelihood() -> Objective:
     """Negative log-likelihood of the innovations, per measured row; needs no truth."""
     return Objective(likelihood=1.0)
 
 
-def truth_likelihood() -> Objective:
-    """Negative log-likelihood of the true attitude under the estimate: error and consistency in one."""
-    return Objective(truth=1.0)
-
-
-def most_probable() -> Objective:
-    """Innovation likelihood and prior: the most probable parameters given what was measured."""
-    return Objective(likelihood=1.0, prior=1.0)
-
-
-def prior() -> Objective:
-    """The prior alone, to be added to others."""
-    return Objective(prior=1.0)
-
-
 NAMED = {
-    "attitude": attitude_error,
-    "rate": rate_error,
-    "position": position_error,
-    "likelihood": innovation_likelihood,
-    "truth": truth_likelihood,
-    "map": most_probable,
-    "prior": prior,
+    "attitude": attitude_error(),
+    "rate": rate_error(),
+    "position": Objective((("position", 1.0),)),
+    "likelihood": innovation_likelihood(),
+    "truth": Objective(truth=1.0),
+    "map": Objective(likelihood=1.0, prior=1.0),
+    "prior": Objective(prior=1.0),
 }
+"""``truth`` is the likelihood of the true attitude, ``map`` gives the most probable parameters."""
 
 
 def parse(text: str) -> Objective:
@@ -138,7 +119,7 @@ def parse(text: str) -> Objective:
     for term in text.split("+"):
         weight, _, name = term.strip().rpartition("*")
         try:
-            total = total + NAMED[name.strip()]() * (float(weight) if weight else 1.0)
+            total = total + NAMED[name.strip()] * (float(weight) if weight else 1.0)
         except (KeyError, ValueError):
             raise TuningError(
                 f"got the objective '{text}', expected a sum of weight*name with the names"
@@ -237,17 +218,6 @@ def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
         elif name in data.truth:
             found[name] = data.truth[name].judged.sum()
     return found
-
-
-def terms(
-    model: Model,
-    params: Parameters,
-    data: Data,
-    names: tuple[str, ...],
-    counts: dict[str, Array] | None = None,
-) -> dict[str, Array]:
-    """As `terms_each`, with the same parameters for all runs."""
-    return terms_each(model, shared(params, data), data, names, counts)
 
 
 def terms_each(

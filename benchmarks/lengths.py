@@ -25,7 +25,7 @@ from rich.progress import Progress
 import tuning
 from jaxekf.estimation import batch, padding
 from jaxekf.simulation import attitude_runs
-from tuning.search import descent
+from tuning.search import evaluation
 
 _RATE = attitude_runs.SensorGrade().optical_hz
 """Steps a second: the gyroscope is an input, each tracker sample a step."""
@@ -116,9 +116,9 @@ def main() -> None:
         tuned, spent = timed(
             lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=iterations)
         )
-        programs = descent._value_and_gradient._cache_size()
+        programs = evaluation._value_and_gradient._cache_size()
         timed(lambda: tuning.tune(runs, model=model, objective="likelihood", iterations=1))
-        more = descent._value_and_gradient._cache_size() - programs
+        more = evaluation._value_and_gradient._cache_size() - programs
         done("done")
     of_tuning = {
         "tune: programs": programs,

@@ -37,7 +37,7 @@ import tuning
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.recordings.types import Recording, from_scipy, to_scipy
 from jaxekf.simulation import attitude_runs
-from tuning.search import descent
+from tuning.search import evaluation
 
 GYROSCOPE_DEG = np.array([[0.05, 0.0, 0.0], [0.03, 0.06, 0.0], [-0.02, 0.01, 0.03]])
 """Factor of the gyroscope's density, deg/s/sqrt(Hz)."""
@@ -82,7 +82,7 @@ def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: f
     """How many times as long the objective takes with its gradient."""
     aim = tuned.objective
     groups = tuning.objective.data.prepare_groups(model, runs, need_truth=aim.needs_truth)
-    counts = descent.total_counts(groups, aim)
+    counts = evaluation.total_counts(groups, aim)
     given = model, aim, tuned.layout, np.asarray(tuned.layout.to_free(tuned.start)), tuned.start
 
     def over(function: Any) -> float:
@@ -91,7 +91,7 @@ def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: f
 
         return timed(all_groups, seconds=seconds).median_s
 
-    return over(descent._value_and_gradient) / over(descent._value)
+    return over(evaluation._value_and_gradient) / over(evaluation._value)
 
 
 def race(
@@ -208,9 +208,14 @@ def main() -> None:
     # First, so that nothing of it is compiled yet.
     size = (2, 6.0) if quick else (10, 60.0)
     if smoke:
-        whole = [whole_tuning(1, 1.0, objective="map", optimiser="fisher", iterations=1)]
+        whole = [
+            whole_tuning(1, 1.0, objective="map", optimiser=tuning.FisherScoring(), iterations=1)
+        ]
     else:
-        whole = [whole_tuning(*size, objective="map", optimiser="fisher"), whole_tuning(*size)]
+        whole = [
+            whole_tuning(*size, objective="map", optimiser=tuning.FisherScoring()),
+            whole_tuning(*size),
+        ]
     for one in whole:
         print(f"a whole tuning: {one}", flush=True)
     count, length = (1, 1.0) if smoke else (2, 6.0) if quick else (8, 40.0)

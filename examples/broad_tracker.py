@@ -8,8 +8,8 @@ are tuned by gradient on the training trials together with the gyroscope's clock
 (`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed. With
 `--calibrate` the objective is the likelihood of what was measured, with priors, and each trial has a
 matrix of its own, that of a test trial found from its innovations alone: its truth is for the score only.
-With `--beside` each training trial is first held out in turn, and noise by Allan deviation alone and
-searches without gradients are set beside the tuning, with the work that each takes.
+With `--baselines` each training trial is first held out in turn, and noise by Allan deviation alone and
+searches without gradients are compared with the tuning, with the work that each takes.
 
 The last line printed is JSON with the attitude RMSE in degrees of each test trial. `--smoke` takes one
 iteration on ten seconds of a trial.
@@ -55,7 +55,9 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--iterations", type=int, default=20)
-    parser.add_argument("--beside", nargs="*", choices=tuning.BESIDE, help="hold out, with these")
+    parser.add_argument(
+        "--baselines", nargs="*", choices=tuning.BASELINES, help="hold out, with these"
+    )
     parser.add_argument("--warm", action="store_true", help="begin with steps on the likelihood")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
@@ -89,11 +91,11 @@ def asked(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def hold_out(
-    runs: list[jaxekf.Recording], beside: list[str], options: dict[str, Any]
+    runs: list[jaxekf.Recording], baselines: list[str], options: dict[str, Any]
 ) -> dict[str, Any]:
     """Hold out each trial in turn, print how each variant does on it, and return all of it for JSON."""
     found = tuning.cross_validate(
-        runs, beside=beside, start=hand_set(), progress=say_progress, **options
+        runs, baselines=baselines, start=hand_set(), progress=say_progress, **options
     )
     errors, nees = found.spread(), found.spread("nees")
     print(
@@ -119,8 +121,8 @@ def main() -> None:
         )
     start = hand_set()
     held_out = None
-    if arguments.beside is not None:
-        held_out = hold_out(training, arguments.beside, asked(arguments))
+    if arguments.baselines is not None:
+        held_out = hold_out(training, arguments.baselines, asked(arguments))
     tuned = tuning.tune(training, start=start, progress=say_progress, **asked(arguments))
     own = tuning.fit_runs(testing, tuned)
     params = [own[trial.name] for trial in testing]

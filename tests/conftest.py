@@ -17,7 +17,7 @@ from hypothesis import settings
 import jaxekf
 from jaxekf._support import compilation
 from jaxekf.estimation.result import Estimate
-from tuning.search import descent
+from tuning.search import evaluation
 
 # Most tests wait for the compiler, not for what it made. Those of the filter itself, long descents and the
 # long forms are compiled as users have it.
@@ -83,8 +83,8 @@ def _compile_descents_well(request):
         if request.path.name in RUN_LONG:
             options = {"static_argnums": (0, 1, 2), "compiler_options": compilation.FAST}
             for name in ("_value", "_value_and_gradient", "_values_and_gradients"):
-                function = getattr(descent, name).__wrapped__
-                patch.setattr(descent, name, jaxekf.jit(function, **options))
+                function = getattr(evaluation, name).__wrapped__
+                patch.setattr(evaluation, name, jaxekf.jit(function, **options))
         yield
 
 

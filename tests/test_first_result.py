@@ -275,16 +275,16 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 import jaxekf
-from tuning.walk import Walk
+from tuning.search._line_search import LineSearch
 
 jaxekf.keep_programs(sys.argv[1])
 slopes = np.array([1.0, 3.0, 10.0])
-walk, found = Walk(np.array([1.0, -2.0, 0.5]), None), []
+search, found = LineSearch(np.array([1.0, -2.0, 0.5]), None), []
 for _ in range(8):
-    point = np.asarray(walk.candidate)
-    walk.move(float(0.5 * point @ (slopes * point)), slopes * point, True)
+    point = np.asarray(search.candidate)
+    search.move(float(0.5 * point @ (slopes * point)), slopes * point, True)
     found.append(counts()["programs"])
-print(json.dumps({"programs": found, "value": walk.value}))
+print(json.dumps({"programs": found, "value": search.value}))
 """
 
 
@@ -303,9 +303,9 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 import jaxekf
 from jaxekf.simulation import demo
-from tuning.data import prepare
-from tuning.descent import total_counts
-from tuning.objectives import attitude_error, innovation_likelihood
+from tuning.objective.data import prepare
+from tuning.objective.objectives import attitude_error, innovation_likelihood
+from tuning.search.evaluation import total_counts
 
 jaxekf.keep_programs(sys.argv[1])
 runs = [jaxekf.load(path) for path in demo.paths(demo.TRAINING[:1])]

@@ -18,11 +18,11 @@ from jaxekf.cli.console import TuningBar
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.recordings.types import from_scipy, to_scipy
 from jaxekf.simulation import attitude_runs
-from tuning import _tune as fit
+from tuning import tuner
 from tuning.comparison import compare, cost, cross_validation
 from tuning.comparison.allan_only import allan_only
 from tuning.objective import objectives
-from tuning.search import derivative_free, descent
+from tuning.search import derivative_free, evaluation
 
 OPTIONS = {
     "objective": "attitude+0.01*likelihood",
@@ -162,9 +162,9 @@ def test_ctrl_c_ends_it(runs, start):
         (lambda runs: tuning.cross_validate(runs, 4), "4 folds for 3 runs"),
         (lambda runs: tuning.cross_validate([*runs, runs[0]]), "run-0"),
         (lambda runs: tuning.cross_validate(runs, validate=runs[:1]), "run-0"),
-        (lambda runs: tuning.cross_validate(runs, beside=["grid"]), "grid"),
-        (lambda runs: tuning.cross_validate(runs, beside="allan"), "a list"),
-        (lambda runs: tuning.cross_validate(runs, beside=["allan"]), "static log"),
+        (lambda runs: tuning.cross_validate(runs, baselines=["grid"]), "grid"),
+        (lambda runs: tuning.cross_validate(runs, baselines="allan"), "a list"),
+        (lambda runs: tuning.cross_validate(runs, baselines=["allan"]), "static log"),
     ],
 )
 def test_nonsense_is_refused_in_a_sentence(runs, call, words):
@@ -193,7 +193,7 @@ def test_command_line(runs, start, found, tmp_path, monkeypatch, told):
     arguments = [*(tmp_path / run.name for run in runs), "--noise", tmp_path / "start"]
     arguments += ["--objective", OPTIONS["objective"], "--iterations", OPTIONS["iterations"]]
     arguments += ["--free", "noise", "--own", "calibration.alignment"]
-    arguments += ["--no-judge", "-o", tmp_path / "tuned"]
+    arguments += ["--no-confidence-intervals", "-o", tmp_path / "tuned"]
     arguments += ["--folds", "all", "--json"] if told == "json" else ["--folds", 0]
     result = CliRunner().invoke(main, ["tune", *map(str, arguments)])
     assert result.exit_code == 0, result.output
@@ -226,6 +226,23 @@ def test_folds_are_a_number_or_all(tmp_path):
     assert "expected a number of folds or 'all'" in " ".join(result.output.split())
 
 
+def test_old_names_work_for_one_release(runs, found, tmp_path):
+    """Would catch a script of the last release that breaks, or one that nobody warns."""
+    with pytest.warns(DeprecationWarning, match="baselines"), pytest.raises(TuningError):
+        tuning.cross_validate(runs, beside=["grid"])  # pyright: ignore[reportCallIssue]
+    with pytest.warns(DeprecationWarning, match=r"Fold\.baselines"):
+        assert found.folds[0].beside is found.folds[0].baselines
+    with pytest.warns(DeprecationWarning, match=r"tuning\.BASELINES"):
+        assert tuning.BESIDE == tuning.BASELINES  # pyright: ignore
+    with pytest.warns(DeprecationWarning, match=r"tuning\.save"):
+        found.folds[0].tuned.save(tmp_path)
+    assert (tmp_path / "tuning.json").is_file()
+    result = CliRunner().invoke(main, ["tune", str(tmp_path), "--beside=allan", "--no-judge"])
+    assert "--beside is now --baselines" in result.output
+    assert "--no-judge is now --no-confidence-intervals" in result.output
+    assert "got --baselines allan without --folds" in " ".join(result.output.split())
+
+
 LIMITS = tuning.Limits(sweeps=1, evaluations=12)
 
 
@@ -238,7 +255,7 @@ def log():
 @pytest.fixture(scope="module")
 def beside(runs, start, log):
     return tuning.cross_validate(
-        runs, start=start, static=log, beside=tuning.BESIDE[::-1], limits=LIMITS, **OPTIONS
+        runs, start=start, static=log, baselines=tuning.BASELINES[::-1], limits=LIMITS, **OPTIONS
     )
 
 
@@ -255,21 +272,21 @@ def test_what_is_set_beside_learns_from_the_folds_runs(runs, start, log, found, 
         coordinates = tuning.tune_by_coordinates(others, sweeps=LIMITS.sweeps, **asked(start))
         simplex = tuning.tune_by_nelder_mead(others, evaluations=LIMITS.evaluations, **asked(start))
         assert coordinates.value < coordinates.history[0].value
-        assert same(fold.beside["coordinates"].params, coordinates.params)
-        assert same(fold.beside["nelder-mead"].params, simplex.params)
+        assert same(fold.baselines["coordinates"].params, coordinates.params)
+        assert same(fold.baselines["nelder-mead"].params, simplex.params)
         model = jaxekf.get_model("loose")
         told = allan_only(model, start, others, log)
-        assert same(fold.beside["allan"].params, told.params)
+        assert same(fold.baselines["allan"].params, told.params)
         assert set(told.taken) >= {"gyroscope", "optical"}
         variants = {"start": start}
-        for name, fitted in fold.beside.items():
+        for name, fitted in fold.baselines.items():
             variants[name] = tuning.fit_runs([runs[i]], fitted)[f"run-{i}"]
             assert not np.array_equal(
                 variants[name].calibration.alignment, fitted.params.calibration.alignment
             )
         expected = tuning.compare("loose", [runs[i]], variants).rows
         got = [row for row in beside.rows if row.run == f"run-{i}"]
-        assert [row.variant for row in got] == ["hold last", "start", *tuning.BESIDE, "tuned"]
+        assert [row.variant for row in got] == ["hold last", "start", *tuning.BASELINES, "tuned"]
         for one, other in zip(got, expected, strict=False):
             np.testing.assert_allclose(one[2:], other[2:], rtol=1e-9)
 
@@ -283,17 +300,17 @@ def test_validation_runs_play_no_part_beside(runs, start, log, beside, monkeypat
         start=start,
         static=log,
         validate=[runs[0].replace(name="judge", imu=runs[1].imu)],
-        beside=["coordinates"],
+        baselines=["coordinates"],
         limits=LIMITS,
         **OPTIONS,
     )
     for one, other in zip(again.folds, beside.folds, strict=True):
-        assert same(one.beside["coordinates"].params, other.beside["coordinates"].params)
+        assert same(one.baselines["coordinates"].params, other.baselines["coordinates"].params)
 
 
 def test_work_is_counted_apart_from_the_rows(beside, monkeypatch):
     """Would catch work of one fold, a gradient that counts as a value, or a clock that reaches the rows."""
-    counts = [fold.beside["coordinates"].evaluations for fold in beside.folds]
+    counts = [fold.baselines["coordinates"].evaluations for fold in beside.folds]
     assert beside.work["coordinates"] == (np.mean(counts), 0.0)
     assert beside.work["nelder-mead"] == (LIMITS.evaluations, 0.0)
     assert beside.work["allan"] == beside.work["start"] == (0.0, 0.0)
@@ -337,10 +354,12 @@ def test_the_tuner_counts_what_it_filters_without_a_gradient(runs, start, found,
         calls["value"] += 1
         return 0.0
 
-    monkeypatch.setattr(fit, "information", information)
-    monkeypatch.setattr(descent, "_value", value)
-    monkeypatch.setattr(descent, "own_step", lambda model, where, free, *given: free)
-    tuned = tuning.tune(runs[:2], validate=runs[2:], start=start, judge=True, **OPTIONS)
+    monkeypatch.setattr(tuner, "information", information)
+    monkeypatch.setattr(evaluation, "_value", value)
+    monkeypatch.setattr(evaluation, "own_step", lambda model, where, free, *given: free)
+    tuned = tuning.tune(
+        runs[:2], validate=runs[2:], start=start, confidence_intervals=True, **OPTIONS
+    )
     rows = [
         int(objectives.visible_rows(tuning.prepare(tuned.model, part, need_truth=False)))
         for part in (runs[:2], runs[2:])
@@ -356,7 +375,12 @@ def test_a_stopped_cross_validation_goes_on(runs, start, log, beside, tmp_path, 
     """Would catch folds or searches that are done again, a fold that begins anew, one that comes back as
     another, and files that stay."""
     file = tmp_path / "state"
-    given = {"start": start, "static": log, "beside": tuning.BESIDE, "limits": LIMITS} | OPTIONS
+    given = {
+        "start": start,
+        "static": log,
+        "baselines": tuning.BASELINES,
+        "limits": LIMITS,
+    } | OPTIONS
     stages, steps, searches = [], [], []
 
     def stop(step, total):
@@ -365,7 +389,7 @@ def test_a_stopped_cross_validation_goes_on(runs, start, log, beside, tmp_path, 
 
     with pytest.raises(KeyboardInterrupt):
         tuning.cross_validate(runs, checkpoint=file, progress=stop, stage=stages.append, **given)
-    assert stages[:4] == [*(f"fold 1/3, {name}" for name in tuning.BESIDE), "fold 1/3"]
+    assert stages[:4] == [*(f"fold 1/3, {name}" for name in tuning.BASELINES), "fold 1/3"]
     kept = sorted(path.name for path in tmp_path.iterdir())
     assert kept == ["state.fold1", "state.fold2", "state.fold2.running"]
 
@@ -442,7 +466,7 @@ def test_allan_only_pools_rests(log):
 
 @pytest.mark.parametrize("told", ["json", "tables"])
 def test_command_line_beside(runs, found, beside, tmp_path, monkeypatch, told):
-    """Would catch --beside, --static or --state that do not reach the folds, work that is not shown, and
+    """Would catch --baselines, --static or --state that do not reach the folds, work that is not shown, and
     folds' files that stay when all is done."""
     seen = {}
 
@@ -454,14 +478,14 @@ def test_command_line_beside(runs, found, beside, tmp_path, monkeypatch, told):
     monkeypatch.setattr(tuning, "cross_validate", cross_validate)
     monkeypatch.setattr(tuning, "tune", lambda given, **options: found.folds[0].tuned)
     jaxekf.save(runs[0], tmp_path / "run")
-    options = "--folds 3 --beside allan --beside coordinates --no-judge"
+    options = "--folds 3 --baselines allan --baselines coordinates --no-confidence-intervals"
     arguments = [tmp_path / "run", *options.split(), "-o", tmp_path / "tuned"]
     arguments += ["--static", tmp_path / "run", "--state", tmp_path / "state"]
     arguments += ["--json"] if told == "json" else []
     result = CliRunner().invoke(main, ["tune", *map(str, arguments)])
     assert result.exit_code == 0, result.output
     assert seen["count"] == 3
-    assert seen["beside"] == ("allan", "coordinates")
+    assert seen["baselines"] == ("allan", "coordinates")
     assert seen["static"].name == "run-0"
     assert seen["checkpoint"] == tmp_path / "state"
     assert not (tmp_path / "state.fold1").exists()
@@ -480,11 +504,11 @@ def test_command_line_beside(runs, found, beside, tmp_path, monkeypatch, told):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--beside", "allan"], "without --folds"),
-        (["--folds", "all", "--static", "log"], "without --beside allan"),
+        (["--baselines", "allan"], "without --folds"),
+        (["--folds", "all", "--static", "log"], "without --baselines allan"),
         (
-            ["--folds", "all", "--beside", "coordinates", "--static", "log"],
-            "without --beside allan",
+            ["--folds", "all", "--baselines", "coordinates", "--static", "log"],
+            "without --baselines allan",
         ),
     ],
 )

@@ -100,7 +100,8 @@ def hide(data, which):
 
 @partial(jax.jit, static_argnums=(0, 1))
 def values(model, where, free, base, data):
-    found = objectives.terms(model, where.from_free(free, base), data, TERMS)
+    every = objectives.shared(where.from_free(free, base), data)
+    found = objectives.terms_each(model, every, data, TERMS)
     return jnp.stack([found[name] for name in TERMS])
 
 

@@ -18,7 +18,7 @@ from jaxekf.filtering.lowering import blocks, lanes, scalar_graph, sparsity, str
 from jaxekf.filtering.model import Belief
 from jaxekf.models import get_model
 from jaxekf.simulation import attitude_runs
-from tuning.search import descent
+from tuning.search import evaluation
 
 
 def test_structure_is_found_where_it_is():
@@ -266,9 +266,9 @@ def test_runs_of_many_lengths_compile_few_programs():
         alone = run_filter(model, params, belief, jax.tree.map(jnp.asarray, lines[i].steps))
         cov = np.asarray(alone.instants.updated.cov)[lines[i].valid]
         assert_tree_close(found[i].cov, cov, 1e-12)
-    descent._value_and_gradient.clear_cache()
+    evaluation._value_and_gradient.clear_cache()
     tuned = tuning.tune(runs, model="loose", objective="likelihood", iterations=2)
-    assert descent._value_and_gradient._cache_size() <= buckets
+    assert evaluation._value_and_gradient._cache_size() <= buckets
     whole_data = tuning.prepare(model, runs)
     alone = tuning.evaluate(model, tuned.objective, tuned.start, whole_data)
     np.testing.assert_allclose(tuned.history[0].training, alone, rtol=1e-10)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import optax
 import pytest
 
 import jaxekf
@@ -15,10 +16,11 @@ from tuning.objective.data import prepare_groups
 from tuning.parametrisation.free_vector import layout
 from tuning.parametrisation.truth_frame import no_correction
 from tuning.persistence import checkpoint
+from tuning.results.tuned import Iteration
 from tuning.search import _minibatch as minibatch
-from tuning.search import multistart as starting
-from tuning.search._minibatch import Batches, cut
-from tuning.search.descent import Best, Descent, Iteration
+from tuning.search import multistart, optimisers
+from tuning.search._minibatch import MinibatchDescent, cut
+from tuning.search.descent import Best, Descent
 
 OPTIONS: dict[str, Any] = {"objective": "likelihood", "free": ["noise"], "iterations": 40}
 MODEL = jaxekf.get_model("loose")
@@ -81,11 +83,13 @@ def test_the_worse_half_is_dropped():
 
     def search(value, stopped=""):
         step = Iteration(7, value, float("nan"), False)
-        return SimpleNamespace(best=Best(None, step), judged=lambda s: s.training, stopped=stopped)
+        return SimpleNamespace(
+            best=Best(None, step), selection_value=lambda s: s.training, stopped=stopped
+        )
 
     values = [3.0, 1.0, 2.0, 5.0, 4.0, 6.0]
     one: Any = [search(value, "converged" if value in (1.0, 6.0) else "") for value in values]
-    found = starting.Race(one, round=8)
+    found = multistart.MultiStart(one, round=8)
     found._drop_half()
     assert set(found.dropped) == {3, 4}
     assert found.running == [0, 2]
@@ -100,17 +104,17 @@ def test_the_winner_stays_the_winner():
         step = Iteration(7, value, float("nan"), False)
         return SimpleNamespace(
             best=Best(None, step),
-            judged=lambda s: s.training,
+            selection_value=lambda s: s.training,
             stopped="converged",
             state_dict=dict,
             restore=lambda kept: None,
         )
 
     one: Any = [search(2.0), search(1.0)]
-    found = starting.Race(one)
+    found = multistart.MultiStart(one)
     assert found.run(15, None) is one[1]
     one[1].best = Best(None, Iteration(9, 3.0, float("nan"), False))
-    again = starting.Race(one)
+    again = multistart.MultiStart(one)
     again.restore(found.state_dict())
     assert again.run(15, None) is one[1]
 
@@ -123,9 +127,9 @@ def test_a_drawn_start_that_cannot_be_warmed_is_kept():
 
     good: Any = SimpleNamespace(history=[], warm=lambda *_: None)
     bad: Any = SimpleNamespace(history=[], warm=fails)
-    starting.Race([good, bad]).warm(3)
+    multistart.MultiStart([good, bad]).warm(3)
     with pytest.raises(TuningError):
-        starting.Race([bad, good]).warm(3)
+        multistart.MultiStart([bad, good]).warm(3)
 
 
 def test_starts_are_drawn_within_their_reach(runs):
@@ -139,7 +143,7 @@ def test_starts_are_drawn_within_their_reach(runs):
     base = as_arrays(MODEL.parameters)._replace(truth=no_correction())
     where = layout(MODEL, base, free)
     middle = np.asarray(where.to_free(base))
-    drawn = np.array(starting.draw(where, middle, 200, seed=3)) - middle
+    drawn = np.array(multistart.draw(where, middle, 200, seed=3)) - middle
     np.testing.assert_array_equal(drawn[0], 0.0)
     reach = np.abs(drawn).max(axis=0)
     labels = where.labels()
@@ -147,7 +151,7 @@ def test_starts_are_drawn_within_their_reach(runs):
         most = {"noise": 1.5 * np.log(10.0), "initial": 0.15, "calibration": 5.0, "truth": 0.0}
         limit = most[label.split(".")[0]]
         assert 0.9 * limit <= reach[i] <= limit, label
-    again = np.array(starting.draw(where, middle, 200, seed=3)) - middle
+    again = np.array(multistart.draw(where, middle, 200, seed=3)) - middle
     np.testing.assert_array_equal(drawn, again)
 
 
@@ -161,7 +165,7 @@ def test_a_start_without_a_finite_objective_begins_nearer(runs, start):
     made[1].begin_at(middle + 1500.0)
     made[2].begin_at(np.full_like(middle, np.nan))
     made[3].begin_at(middle + 1.0)
-    found = starting.Race(made)
+    found = multistart.MultiStart(made)
     for _ in range(6):
         found._round(patience=15)
     assert found.outcomes[1].value < np.inf
@@ -186,7 +190,7 @@ def stop_at(number):
 def test_goes_on_after_a_stop(how, runs, start, race, tmp_path):
     """Would catch a part of the state that is not kept: who is dropped, Adam's moments, the rate."""
     options: dict[str, Any] = {**OPTIONS, "start": start}
-    options |= {"starts": 4} if how == "starts" else {"optimiser": "adam", "batch": 2}
+    options |= {"starts": 4} if how == "starts" else {"optimiser": tuning.Adam(batch=2)}
     whole = race if how == "starts" else tuning.tune(runs, **options)
     state = tmp_path / "state.npz"
     for number in (5, 11):
@@ -225,7 +229,7 @@ def test_batches_come_to_the_same_place(runs, start, alone):
     """Would catch a gradient of some runs that is not that of the whole on average, a rate that never
     falls, and a best that was not judged on all runs."""
     longer: dict[str, Any] = OPTIONS | {"iterations": 80}
-    tuned = tuning.tune(runs, start=start, optimiser="adam", batch=2, **longer)
+    tuned = tuning.tune(runs, start=start, optimiser=tuning.Adam(batch=2), **longer)
     assert tuned.best.training <= alone.best.training + 5e-3
     assert tuned.best.training == min(step.training for step in tuned.history)
     assert tuned.best.training < tuned.history[0].training - 0.1
@@ -248,7 +252,9 @@ def test_the_batches_of_a_pass_are_all_runs(runs, start):
     their rows: Adam would end elsewhere than at the minimum for all runs."""
     where = layout(MODEL, start, OPTIONS["free"])
     groups = prepare_groups(MODEL, runs, need_truth=False)
-    search = Batches(MODEL, tuning.innovation_likelihood(), where, start, groups, None, 3, size=2)
+    search = MinibatchDescent(
+        MODEL, tuning.innovation_likelihood(), where, start, groups, None, 3, size=2
+    )
     search.free = search.free + 0.3
     parts = cut(groups[0], 2, np.random.default_rng(0))
     each = [search.slope(groups[0], batch, len(parts)) for batch in parts]
@@ -262,14 +268,14 @@ def test_goes_on_in_the_middle_of_a_pass(runs, start, monkeypatch):
     where = layout(MODEL, start, OPTIONS["free"])
     groups = prepare_groups(MODEL, runs, need_truth=False)
     given = MODEL, tuning.innovation_likelihood(), where, start, groups, None, 4
-    whole = Batches(*given, size=2)
+    whole = MinibatchDescent(*given, size=2)
     whole.run(15, None)
     monkeypatch.setattr(minibatch, "KEEP_S", -1.0)
     kept = []
-    stopped = Batches(*given, size=2, keep=lambda state: kept.append(state))
+    stopped = MinibatchDescent(*given, size=2, keep=lambda state: kept.append(state))
     stopped.run(15, None)
     middle = next(state for state in kept[2:] if state["batches_done"] == 1)
-    again = Batches(*given, size=2)
+    again = MinibatchDescent(*given, size=2)
     again.restore(middle)
     again.run(15, None)
     np.testing.assert_array_equal(again.free, whole.free)
@@ -281,7 +287,7 @@ def test_a_pass_that_fails_is_repeated_from_the_best(runs, start):
     where = layout(MODEL, start, OPTIONS["free"])
     groups = prepare_groups(MODEL, runs, need_truth=False)
     aim = tuning.innovation_likelihood()
-    search = Batches(MODEL, aim, where, start, groups, None, 3, size=2)
+    search = MinibatchDescent(MODEL, aim, where, start, groups, None, 3, size=2)
     search.rate = 2000.0
     search.run(15, None)
     assert [step.rejected for step in search.history] == [False, True, True]
@@ -294,12 +300,37 @@ def test_a_pass_that_fails_is_repeated_from_the_best(runs, start):
     ("options", "words"),
     [
         ({"starts": 0}, "0 starts"),
-        ({"optimiser": "adam", "starts": 2}, "2 starts with adam"),
-        ({"batch": 4}, "another optimiser than adam"),
-        ({"optimiser": "adam", "batch": 0}, "batches of 0"),
+        ({"optimiser": tuning.Adam(), "starts": 2}, "2 starts with adam"),
     ],
 )
 def test_what_does_not_go_together_is_refused(options, words, runs):
     """Would catch an option that is passed over in silence."""
     with pytest.raises(TuningError, match=words):
         tuning.tune(runs, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "batch", "words"),
+    [("sgd", None, "one of optax"), ("lbfgs", 4, "another optimiser"), ("adam", 0, "batches of 0")],
+)
+def test_names_of_optimisers(name, batch, words):
+    """Would catch a name or a batch of the command line that is passed over in silence."""
+    with pytest.raises(TuningError, match=words):
+        optimisers.from_name(name, batch)
+    assert optimisers.from_name("adam", 3) == tuning.Adam(batch=3)
+
+
+def test_old_arguments_of_the_optimiser_work_for_one_release():
+    """Would catch a script of the last release that breaks, or one that nobody warns."""
+    with pytest.warns(DeprecationWarning, match=r"optimiser=tuning\.FisherScoring\(\)"):
+        assert optimisers.as_optimiser("fisher") == tuning.FisherScoring()
+    with pytest.warns(DeprecationWarning, match=r"tuning\.Adam\(batch=2\)"):
+        assert optimisers.as_optimiser("adam", 2) == tuning.Adam(batch=2)
+
+
+def test_a_state_belongs_to_one_optimiser():
+    """Would catch a tuning that goes on from the state of another optimiser, or one that never goes on."""
+    every = tuning.LBFGS(), tuning.FisherScoring(), tuning.Adam(), tuning.Adam(batch=3)
+    own = [optimisers.as_optimiser(optax.sgd(rate)) for rate in (0.1, 0.2)]
+    assert len({repr(one) for one in (*every, own[0])}) == 5
+    assert repr(own[0]) == repr(own[1])

@@ -154,7 +154,7 @@ def test_the_scale_of_all_covariances_leaves_the_estimate(short):
 
 def test_files_say_units_and_origin(full, tmp_path):
     """Would catch parameters that do not survive the round trip, or files that say nothing."""
-    full.save(tmp_path)
+    tuning.save(full, tmp_path)
     text = (tmp_path / "noise.toml").read_text()
     for word in (
         'unit = "rad/s/sqrt(Hz)"',
@@ -218,7 +218,7 @@ def test_any_free_vector_is_a_positive_definite_covariance(values):
                 objective="likelihood",
                 rescale=True,
                 iterations=1,
-                optimiser="fisher",
+                optimiser=tuning.FisherScoring(),
             ),
             "no scored encoder",
         ),
@@ -239,16 +239,16 @@ def test_objectives_add_and_scale():
     assert "0.5" in both.describe()
 
 
-def test_walk_stops_when_it_has_converged():
+def test_line_search_stops_when_it_has_converged():
     """Would catch a line search that never ends at a minimum."""
-    steps = line_search.Walk(jnp.array([3.0, -2.0]), None)
+    steps = line_search.LineSearch(jnp.array([3.0, -2.0]), None)
     for _ in range(60):
         value = float(jnp.sum(steps.candidate**2) + 1.0)
         if steps.move(value, 2.0 * steps.candidate, True):
             break
     else:
         pytest.fail("no stop")
-    np.testing.assert_allclose(steps.stand, 0.0, atol=1e-2)
+    np.testing.assert_allclose(steps.accepted, 0.0, atol=1e-2)
 
 
 def test_what_is_not_free_is_not_touched(full):
@@ -275,7 +275,7 @@ def test_an_interrupted_tuning_keeps_the_best(short):
 
 
 def test_calibration_of_another_model_does_not_stay(tmp_path):
-    """Would catch an old calibration.toml beside new noise."""
+    """Would catch an old calibration.toml next to new noise."""
     for name in ("loose", "loose_rate"):
         model = jaxekf.get_model(name)
         jaxekf.save_parameters(tmp_path, model, model.parameters, {})

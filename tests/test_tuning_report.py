@@ -22,12 +22,11 @@ from jaxekf.reporting.report import _tuned as saved
 from jaxekf.reporting.report import _tuning_figures as tuning_figures
 from jaxekf.reporting.report import write_report
 from jaxekf.simulation import attitude_runs
-from tuning.comparison.compare import as_dicts
 from tuning.objective.fisher_information import Information
 from tuning.persistence import _tuning_warnings as tuning_warnings
 from tuning.persistence.tuning_document import record
-from tuning.search.descent import Iteration
-from tuning.search.multistart import Outcome
+from tuning.results.comparison import as_dicts
+from tuning.results.tuned import Iteration, Outcome
 
 NAME = 'free <b>&"5"'
 COLUMNS = (
@@ -204,7 +203,7 @@ def write(folder, document):
 
 def test_the_record_is_the_tuning(found, rows, tmp_path):
     """Would catch a number that is not the tuning's, NaN in JSON, or a value that the files do not hold."""
-    found.save(tmp_path, rows=rows)
+    tuning.save(found, tmp_path, rows=rows)
     text = (tmp_path / "tuning.json").read_text("utf-8")
     told = json.loads(text, parse_constant=pytest.fail)
     assert told == record(found, rows=rows)
@@ -253,7 +252,7 @@ def test_how_far_a_bounded_number_moved(found):
 def test_rows_of_other_runs_than_said_are_refused(found, rows, tmp_path):
     """Would catch training runs that pass for held-out ones, or half a folder."""
     with pytest.raises(TuningError, match="expected 'validation runs'"):
-        found.save(tmp_path / "tuned", rows=rows, judged_on="training runs")
+        tuning.save(found, tmp_path / "tuned", rows=rows, judged_on="training runs")
     assert not (tmp_path / "tuned").exists()
     for name, kind in (("run-0", "training runs"), ("else", "other runs")):
         assert record(found, rows=[rows[0]._replace(run=name)])["judged_on"] == kind
@@ -261,12 +260,12 @@ def test_rows_of_other_runs_than_said_are_refused(found, rows, tmp_path):
 
 def test_what_the_tuner_says_is_understood(short, tmp_path):
     """Would catch words of the tuner that the warnings no longer know, or a save without rows."""
-    short.save(tmp_path)
+    tuning.save(short, tmp_path)
     told = json.loads((tmp_path / "tuning.json").read_text("utf-8"))
     assert told["rows"] == [] and told["judged_on"] is None and told["folds"] is None
     assert [n["left_open"] for n in told["numbers"]] == [False] * len(told["numbers"])
     assert told["warnings"][0].startswith(
-        "No run was held out: the tuning was judged by the training"
+        "No run was held out: the tuning was validated on the training"
     )
     assert told["warnings"][1] == f"The search did not converge: {short.stopped}; ask for more"
     stopped = replace(short, stopped="interrupted; the best so far is kept")
@@ -313,7 +312,9 @@ def worse_fold(document):
         (lambda d: None, []),
         (
             opened,
-            ["leave noise.optical open, so that it stays at its start: turning about two axes"],
+            [
+                "not determine noise.optical, so that it keeps its initial value: turning about two axes"
+            ],
         ),
         (change(0, change=9.9), []),
         (change(0, change=10.1), ["noise.optical moved by more than a factor of 10"]),

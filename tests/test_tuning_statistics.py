@@ -68,7 +68,12 @@ def found():
     """A tuning of each seed's run."""
     return [
         tuning.tune(
-            [planted(seed)], objective="map", free=FREE, start=off(), judge=True, iterations=60
+            [planted(seed)],
+            objective="map",
+            free=FREE,
+            start=off(),
+            confidence_intervals=True,
+            iterations=60,
         )
         for seed in range(SEEDS)
     ]
@@ -96,7 +101,12 @@ def test_held_out_errors_are_as_large_as_said():
     """
     learnt = [planted(seed) for seed in range(16 if LONG else 8)]
     tuned = tuning.tune(
-        learnt, objective="map", free=FREE, start=off(), iterations=60, optimiser="fisher"
+        learnt,
+        objective="map",
+        free=FREE,
+        start=off(),
+        iterations=60,
+        optimiser=tuning.FisherScoring(),
     )
     runs = [planted(1000 + seed) for seed in range(50 if LONG else 16)]
     params = [tuned.params] * len(runs)
@@ -122,7 +132,11 @@ def test_what_no_motion_told_is_left_alone():
     flat = replace(motion, amplitude=still)
     runs = [attitude_runs.recording(f"flat-{i}", flat, seed=i, duration_s=40.0) for i in range(2)]
     one = tuning.tune(
-        runs[:1], objective="map", free=["noise", *FREE[2:]], judge=True, iterations=60
+        runs[:1],
+        objective="map",
+        free=["noise", *FREE[2:]],
+        confidence_intervals=True,
+        iterations=60,
     )
     # A run that turns about z tells the third column, what the gyroscope makes of a turn about z.
     untold = {f"calibration.gyroscope_matrix[{i}]" for i in (0, 1, 3, 4, 6, 7)}

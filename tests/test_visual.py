@@ -479,9 +479,9 @@ def test_the_camera_is_found_where_it_is():
         model=jaxekf.robust("visual", "none"),
         objective="map",
         free=["calibration.lever_arm", "calibration.alignment"],
-        optimiser="fisher",
+        optimiser=tuning.FisherScoring(),
         iterations=12,
-        judge=True,
+        confidence_intervals=True,
     )
     calibration = tuned.params.calibration
     off = Rotation.from_rotvec(calibration.alignment) * Rotation.from_rotvec(turn).inv()

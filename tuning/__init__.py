@@ -5,18 +5,9 @@ from typing import TYPE_CHECKING
 from jaxekf._support.lazy import attributes
 
 if TYPE_CHECKING:
-    from tuning._tune import Tuned, fit_runs, tune
-    from tuning.comparison.baselines import BESIDE
-    from tuning.comparison.compare import Comparison, Row, compare, mean_by_variant
-    from tuning.comparison.cost import Work
-    from tuning.comparison.cross_validation import (
-        CrossValidation,
-        Fold,
-        Limits,
-        ParameterSpread,
-        Spread,
-        cross_validate,
-    )
+    from tuning.comparison.baselines import BASELINES
+    from tuning.comparison.compare import compare
+    from tuning.comparison.cross_validation import Limits, cross_validate
     from tuning.objective.data import Data, prepare
     from tuning.objective.fisher_information import Information
     from tuning.objective.objectives import (
@@ -31,16 +22,24 @@ if TYPE_CHECKING:
     from tuning.parametrisation.truth_frame import TruthFrame
     from tuning.persistence.fold_checkpoint import forget_folds
     from tuning.persistence.tuning_document import save_record
-    from tuning.results import Fitted
-    from tuning.search.derivative_free import Searched, tune_by_coordinates, tune_by_nelder_mead
-    from tuning.search.descent import Iteration
-    from tuning.search.multistart import Outcome
+    from tuning.persistence.tuning_folder import save
+    from tuning.results.comparison import Comparison, Row, mean_by_variant
+    from tuning.results.fitted import Fitted
+    from tuning.results.held_out import CrossValidation, Fold, ParameterSpread, Spread, Work
+    from tuning.results.searched import Searched
+    from tuning.results.tuned import Iteration, Outcome, Tuned
+    from tuning.search.derivative_free import tune_by_coordinates, tune_by_nelder_mead
+    from tuning.search.optimisers import LBFGS, Adam, FisherScoring
+    from tuning.tuner import fit_runs, tune
 
 __all__ = [
-    "BESIDE",
+    "BASELINES",
+    "LBFGS",
+    "Adam",
     "Comparison",
     "CrossValidation",
     "Data",
+    "FisherScoring",
     "Fitted",
     "Fold",
     "Free",
@@ -69,6 +68,7 @@ __all__ = [
     "prepare",
     "rate_error",
     "read_free",
+    "save",
     "save_record",
     "scaled",
     "tune",
@@ -78,38 +78,34 @@ __all__ = [
 ]
 
 _PLACES = {
-    "tuning.comparison.baselines": ("BESIDE",),
-    "tuning.objective.data": ("Data", "prepare"),
-    "tuning.search.derivative_free": ("Searched", "tune_by_coordinates", "tune_by_nelder_mead"),
-    "tuning.search.descent": ("Iteration",),
-    "tuning._tune": ("Tuned", "fit_runs", "tune"),
-    "tuning.results": ("Fitted",),
-    "tuning.comparison.cross_validation": (
-        "CrossValidation",
-        "Fold",
-        "Limits",
-        "ParameterSpread",
-        "Spread",
-        "cross_validate",
-    ),
-    "tuning.parametrisation.truth_frame": ("TruthFrame",),
-    "tuning.objective.fisher_information": ("Information",),
-    "tuning.persistence.fold_checkpoint": ("forget_folds",),
-    "tuning.parametrisation.free_vector": ("Free", "Layout", "layout", "scaled", "with_axes"),
-    "tuning.objective.objectives": (
+    "tuning.comparison.baselines": ["BASELINES"],
+    "tuning.comparison.compare": ["compare"],
+    "tuning.comparison.cross_validation": ["Limits", "cross_validate"],
+    "tuning.objective.data": ["Data", "prepare"],
+    "tuning.objective.fisher_information": ["Information"],
+    "tuning.objective.objectives": [
         "Objective",
         "attitude_error",
         "evaluate",
         "innovation_likelihood",
         "rate_error",
-    ),
-    "tuning.persistence.tuning_document": ("save_record",),
-    "tuning.parametrisation.free_toml": ("read_free",),
-    "tuning.search.multistart": ("Outcome",),
-    "tuning.comparison.compare": ("Comparison", "Row", "compare", "mean_by_variant"),
-    "tuning.comparison.cost": ("Work",),
+    ],
+    "tuning.parametrisation.free_toml": ["read_free"],
+    "tuning.parametrisation.free_vector": ["Free", "Layout", "layout", "scaled", "with_axes"],
+    "tuning.parametrisation.truth_frame": ["TruthFrame"],
+    "tuning.persistence.fold_checkpoint": ["forget_folds"],
+    "tuning.persistence.tuning_document": ["save_record"],
+    "tuning.persistence.tuning_folder": ["save"],
+    "tuning.results.comparison": ["Comparison", "Row", "mean_by_variant"],
+    "tuning.results.fitted": ["Fitted"],
+    "tuning.results.held_out": ["CrossValidation", "Fold", "ParameterSpread", "Spread", "Work"],
+    "tuning.results.searched": ["Searched"],
+    "tuning.results.tuned": ["Iteration", "Outcome", "Tuned"],
+    "tuning.search.derivative_free": ["tune_by_coordinates", "tune_by_nelder_mead"],
+    "tuning.search.optimisers": ["LBFGS", "Adam", "FisherScoring"],
+    "tuning.tuner": ["fit_runs", "tune"],
 }
 
 if not TYPE_CHECKING:
-    # Hidden from type checkers, which would take any name for one that is there.
-    __getattr__, __dir__ = attributes(__name__, _PLACES)
+    # Hidden from type checkers, which would accept any name.
+    __getattr__, __dir__ = attributes(__name__, _PLACES, old_names={"BESIDE": "BASELINES"})

@@ -2,12 +2,13 @@
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
 from types import ModuleType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 # Where modules are now: "old>new" where the name changed too, "name" where only the room did.
 _ROOMS = {
@@ -82,7 +83,7 @@ _ROOMS = {
         "datasets.demo simulate>attitude_runs simulate_camera>camera_runs "
         "simulate_surgery>gyro_free_runs simulate_tool>marker_runs"
     ),
-    "tuning": "fitted>results fit>_tune",
+    "tuning": "fit>tuner",
     "tuning.comparison": (
         "validation>compare folds>cross_validation beside>baselines allan_only work>cost"
     ),
@@ -93,6 +94,7 @@ _ROOMS = {
     "tuning.persistence": (
         "resume>checkpoint kept>fold_checkpoint record>tuning_document cautions>_tuning_warnings"
     ),
+    "tuning.results": "fitted",
     "tuning.search": (
         "walk>_line_search descent batches>_minibatch starts>multistart derivative_free "
         "ways>optimisers"
@@ -109,6 +111,17 @@ _NAMES = {
     },
     "jaxekf.datasets": {"demo": "jaxekf.simulation:demo"},
     "jaxekf.static_noise": {"read_log": "jaxekf.io.run_folder:read_log"},
+    "tuning.descent": {"total_counts": "tuning.search.evaluation:total_counts"},
+    "tuning.beside": {"BESIDE": "tuning.comparison.baselines:BASELINES"},
+    "tuning.folds": {
+        name: f"tuning.results.held_out:{name}" for name in ("ParameterSpread", "Spread")
+    },
+    "tuning.work": {"Work": "tuning.results.held_out:Work"},
+    "tuning.fitted": {"Fit": "tuning.results.fitted:FittedParameters"},
+    "tuning.validation": {
+        name: f"tuning.results.comparison:{name}" for name in ("as_dicts", "mean_by_variant")
+    },
+    "tuning.walk": {"Walk": "tuning.search._line_search:LineSearch"},
 }
 
 
@@ -126,13 +139,39 @@ def _moved() -> dict[str, str]:
 MOVED = _moved()
 
 
-def moved(name: str, stacklevel: int) -> ModuleType:
-    """The module that was `name`, which is warned of at the caller's line."""
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def warn_renamed(old: str, new: str, stacklevel: int = 2) -> None:
+    """Warn of an old name, at the line of the caller's caller unless given."""
     warnings.warn(
-        f"the module {name} is now {MOVED[name]}; the old name will be gone in the next release",
+        f"{old} is now {new}; the old name will be gone in the next release",
         DeprecationWarning,
         stacklevel=stacklevel + 1,
     )
+
+
+def renamed_arguments(**renamed: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator of a function that takes keyword arguments under their old names too: ``old="new"``."""
+
+    def decorated(function: Callable[P, T]) -> Callable[P, T]:
+        @wraps(function)
+        def call(*args: P.args, **options: P.kwargs) -> T:
+            for old, new in renamed.items():
+                if old in options:
+                    warn_renamed(f"the argument {old} of {function.__name__}", new)
+                    options[new] = options.pop(old)
+            return function(*args, **options)
+
+        return call
+
+    return decorated
+
+
+def moved(name: str, stacklevel: int) -> ModuleType:
+    """The module that was `name`, which is warned of at the caller's line."""
+    warn_renamed(f"the module {name}", MOVED[name], stacklevel + 1)
     module = import_module(MOVED[name])
     for old, place in _NAMES.get(name, {}).items():
         home, _, new = place.partition(":")

@@ -1,4 +1,4 @@
-"""Tables of tunings: variants beside each other, and parameters with their units."""
+"""Tables of tunings: scores by variant, and parameters with their units."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -19,7 +19,7 @@ def units_by_name(model: Model) -> dict[str, str]:
 
 
 def in_degrees(unit: str) -> tuple[Callable[[Any], Any], str]:
-    """What turns a value into the unit that is shown, and that unit."""
+    """Function that converts a value to the unit that is shown, and that unit."""
     turn = np.rad2deg if unit.startswith("rad") else np.asarray
     return turn, unit.replace("rad", "deg", 1)
 
@@ -38,10 +38,10 @@ def print_comparison(
     over_runs: Mapping[str, Callable[[str], dict[str, float]]] | None = None,
     work: Mapping[str, float] | None = None,
 ) -> None:
-    """The table that sets variants beside each other, run by run and below that over the runs.
+    """Print the scores of all variants, run by run and then over the runs.
 
-    `over_runs` has, for each line of that kind, what tells one column by variant; their mean unless given.
-    `work` tells by variant what the line of the means has in one more column.
+    `over_runs` has functions from a column to a statistic by variant, by name; the mean unless given.
+    `work` has entries by variant for one more column in the line of the means.
     """
     columns = {
         "attitude_rmse_deg": "attitude RMSE\n(deg)",
@@ -55,8 +55,8 @@ def print_comparison(
             "position_nees": "position\nNEES",
         }
     shown = [[row.run, row.variant, *(getattr(row, field) for field in columns)] for row in rows]
-    for name, told in (over_runs or {"mean": partial(tuning.mean_by_variant, rows)}).items():
-        values = {field: told(field) for field in columns}
+    for name, statistic in (over_runs or {"mean": partial(tuning.mean_by_variant, rows)}).items():
+        values = {field: statistic(field) for field in columns}
         for variant in dict.fromkeys(row.variant for row in rows):
             shown.append([name, variant, *(values[field][variant] for field in columns)])
     if work:

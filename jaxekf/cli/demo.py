@@ -24,7 +24,8 @@ from jaxekf.io.run_folder import load
 from jaxekf.models import get_model
 from jaxekf.recordings.types import Recording
 from jaxekf.simulation import demo as runs
-from tuning.comparison.compare import as_dicts, compare_estimates
+from tuning.comparison.compare import compare_estimates
+from tuning.results.comparison import as_dicts
 
 # What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
@@ -83,7 +84,7 @@ def demo(output: Path, as_json: bool) -> None:
 
     figures = []
     with whole_folder(output, "demo.json", overwrite=True) as folder:
-        tuned.save(folder, rows=compared.rows)
+        tuning.save(tuned, folder, rows=compared.rows)
         for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
             found = diagnose(made, recording).as_dict(curves=True)
             made.save(folder / "result" / recording.name, diagnosis=found)

@@ -1,4 +1,4 @@
-"""`jaxekf tune --folds`: its option, and its tables."""
+"""`jaxekf tune --folds`: its options and tables."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -16,7 +16,7 @@ from jaxekf.recordings.types import Recording
 
 
 def _number(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
-    """0 for one fold for each run."""
+    """Number of folds; 0 for one for each run."""
     if value is None or value == "all":
         return None if value is None else 0
     if not value.isdecimal():
@@ -28,36 +28,35 @@ folds_option = click.option(
     "--folds",
     metavar="K",
     callback=_number,
-    help="First tune K times, each time without every K-th run, and judge it on those; all (or 0) leaves"
-    " out each run once.",
+    help="Number of folds of a cross-validation before the tuning, each of every K-th run; all (or 0): one"
+    " for each run.  [default: no cross-validation]",
 )
 
 
-beside_option = click.option(
-    "--beside",
+baselines_option = click.option(
+    "--baselines",
     multiple=True,
-    type=click.Choice(tuning.BESIDE),
-    help="With --folds: what is judged beside the tuning, allan (the start with what the runs' rest tells),"
-    " coordinates or nelder-mead (searches without gradients), with the work of each; repeatable.",
+    type=click.Choice(tuning.BASELINES),
+    help="Baseline for --folds: allan (the start with the sensor noise of static intervals), coordinates or"
+    " nelder-mead (searches without gradients), with the work of each; repeatable.",
 )
 static_option = click.option(
     "--static",
     type=click.Path(path_type=Path),
-    help="With --beside allan: a static log, or a run that rests, to take noise from in place of the runs'"
-    " rest.",
+    help="Static log for --baselines allan, or a run at rest.  [default: the runs' static intervals]",
 )
 
 
-def check_folds(folds: int | None, beside: Sequence[str], static: Path | None) -> None:
-    """Raise `click.UsageError` for options that belong to others which are not there."""
-    if beside and folds is None:
+def check_folds(folds: int | None, baselines: Sequence[str], static: Path | None) -> None:
+    """Raise `click.UsageError` for options without those that they belong to."""
+    if baselines and folds is None:
         raise click.UsageError(
-            f"got --beside {beside[0]} without --folds, expected folds to judge it in; add --folds all"
+            f"got --baselines {baselines[0]} without --folds, expected folds; add --folds all"
         )
-    if static is not None and "allan" not in beside:
+    if static is not None and "allan" not in baselines:
         raise click.UsageError(
-            f"got --static {static} without --beside allan, expected what is to use it; add that, or leave"
-            " it out"
+            f"got --static {static} without --baselines allan, expected the baseline; add that, or leave it"
+            " out"
         )
 
 
@@ -68,7 +67,7 @@ def held_out(
     static: Path | None,
     **options: Any,
 ) -> tuning.CrossValidation:
-    """The cross-validation that was asked for, with a progress bar; 0 folds for one for each run."""
+    """Cross-validate with a progress bar; 0 folds for one for each run."""
     with tuning_progress(iterations) as bar:
         return tuning.cross_validate(
             runs,
@@ -82,12 +81,12 @@ def held_out(
 
 
 def print_folds(found: tuning.CrossValidation) -> None:
-    """Held-out runs, how far they spread, and what the folds found."""
+    """Print held-out runs with their statistics, and the parameters of the folds."""
 
-    def told(of: str, column: str) -> dict[str, float]:
-        return {name: getattr(spread, of) for name, spread in found.spread(column).items()}
+    def statistic(name: str, column: str) -> dict[str, float]:
+        return {key: getattr(spread, name) for key, spread in found.spread(column).items()}
 
-    over_runs = {of: partial(told, of) for of in tuning.Spread._fields}
+    over_runs = {name: partial(statistic, name) for name in tuning.Spread._fields}
     title = "Held out: each run by a tuning without it"
     print_comparison(title, found.rows, over_runs, found.forward)
     if found.forward:
@@ -101,7 +100,7 @@ def print_folds(found: tuning.CrossValidation) -> None:
         turn, unit = in_degrees(units[name])
         for at in np.ndindex(spread.start.shape):
             if name.startswith("noise.") and len(at) == 2 and at[1] > at[0]:
-                continue  # above the diagonal of a factor there is nothing
+                continue  # a triangular factor is zero above its diagonal
             entry = [short(turn(value[at])) for value in spread[:3]]
             rows.append([name + (str(list(at)) if at else ""), *entry, unit])
     print_table(

@@ -1,7 +1,7 @@
-"""`jaxekf tune`: noise, and calibration where asked, from recorded runs."""
+"""`jaxekf tune`: noise, and calibration if asked, from recorded runs."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 import jax
@@ -24,33 +24,40 @@ from jaxekf.cli.console import (
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.cli.folds import (
-    beside_option,
+    baselines_option,
     check_folds,
     folds_option,
     held_out,
     print_folds,
     static_option,
 )
+from jaxekf.cli.renamed import renamed_options
 from jaxekf.estimation import parameters
 from jaxekf.filtering.model import Parameters
 from jaxekf.io.atomic import check_output
 from jaxekf.models import get_model
 from jaxekf.recordings.types import Recording
-from tuning.comparison.compare import as_dicts
 from tuning.objective.objectives import parse
 from tuning.parametrisation.free_toml import read_free
 from tuning.parametrisation.free_vector import AXES
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
-from tuning.search.optimisers import OPTIMISERS
+from tuning.results.comparison import as_dicts
+from tuning.search.optimisers import NAMED, from_name
+
+_RENAMED = {
+    "--judge": "--confidence-intervals",
+    "--no-judge": "--no-confidence-intervals",
+    "--beside": "--baselines",
+}
 
 
-@click.command()
+@click.command(cls=renamed_options(_RENAMED))
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--validate",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="A run the tuner does not learn from but is judged by; repeatable.",
+    help="Validation run, which chooses the best iteration; repeatable.  [default: the training runs]",
 )
 @model_option
 @noise_option
@@ -59,103 +66,118 @@ from tuning.search.optimisers import OPTIMISERS
     "--objective",
     default="attitude",
     show_default=True,
-    help="attitude, rate, likelihood, or a weighted sum such as attitude+0.1*likelihood.",
+    help="Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
+    " attitude+0.1*likelihood.",
 )
 @click.option(
     "--free",
     multiple=True,
-    help="What may change: noise, calibration, initial or one leaf; repeatable.  [default: noise]",
+    help="Free parameters: noise, calibration, initial, truth or one leaf; repeatable.  [default: noise]",
 )
 @click.option(
     "--own",
     multiple=True,
-    help="What may change and each run has its own of, such as calibration.alignment; repeatable.",
+    help="Parameter estimated separately for each run, such as calibration.alignment; repeatable.",
 )
 @click.option(
     "--parameters",
     "spec",
     type=click.Path(path_type=Path),
-    help="What may change, with priors and bounds, as [[free]] tables in a TOML file: name, each_run,"
-    " prior, bounds.",
+    help="TOML file of free parameters with priors and bounds, in [[free]] tables: name, each_run, prior,"
+    " bounds.",
 )
 @click.option(
     "--axes",
     type=click.Choice(AXES),
     default=None,
-    help="One deviation for all axes, one for each, or a full matrix.  [default: as the start has it]",
+    help="Shape of free noise: one deviation for all axes, one for each, or a full matrix.  [default: as at"
+    " the start]",
 )
 @click.option(
     "--optimiser",
-    type=click.Choice(OPTIMISERS),
+    type=click.Choice(tuple(NAMED)),
     default="lbfgs",
     show_default=True,
-    help="fisher scoring takes few steps to the end; for likelihood or map, and up to some thirty numbers."
-    " adam takes some runs at a time, for very many.",
+    help="Optimiser: lbfgs; fisher scoring, which takes few steps, for likelihood or map with up to about"
+    " thirty numbers; adam on minibatches, for very many runs.",
 )
 @click.option(
     "--starts",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Search from so many starts side by side, the given one and others drawn about it; the worse half"
-    " is dropped after 8, 16 and 32 iterations.",
+    help="Number of starts, the given one and samples about it; successive halving drops the worse half"
+    " after 8, 16 and 32 iterations.",
 )
 @click.option(
     "--batch",
     type=click.IntRange(1),
-    help="Runs of a step of adam; an iteration is a pass over all of them.  [default: 16]",
+    help="Runs per step of adam; an iteration is a pass over all runs.  [default: 16]",
 )
 @click.option(
     "--seed",
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Of the starts that are drawn, and of the order of adam's batches.",
+    help="Seed of the sampled starts, and of the order of adam's batches.",
 )
-@click.option("--iterations", type=click.IntRange(1), default=60, show_default=True)
+@click.option(
+    "--iterations",
+    type=click.IntRange(1),
+    default=60,
+    show_default=True,
+    help="Largest number of iterations.",
+)
 @click.option(
     "--patience",
     type=click.IntRange(1),
     default=15,
     show_default=True,
-    help="Iterations without improvement before stopping.",
+    help="Largest number of iterations without improvement.",
 )
 @click.option(
     "--burn-in",
     type=click.FloatRange(0.0),
     default=0.0,
     show_default=True,
-    help="Seconds at the start of each run that do not count.",
+    help="Time at the start of each run that does not count, s.",
 )
 @click.option(
     "--rescale/--no-rescale",
     default=None,
-    help="Scale Q, R and P0 so that errors match them.  [default: unless the likelihood counts]",
+    help="Scaling of Q, R and P0 after the search so that errors match them.  [default: if noise is free"
+    " and the objective has errors alone]",
 )
-@click.option("--smooth", is_flag=True, help="Errors are those of the smoothed estimate.")
+@click.option("--smooth", is_flag=True, help="Errors of the smoothed estimate.")
 @click.option(
-    "--judge/--no-judge",
+    "--confidence-intervals/--no-confidence-intervals",
     default=True,
     show_default=True,
-    help="Tell what the data determine, with 95 % intervals; what they leave open stays at its start.",
+    help="95 % confidence intervals from the Fisher information; unobservable parameters revert to their"
+    " initial values.",
 )
 @click.option(
     "--warm/--no-warm",
     default=None,
-    help="Begin with some steps on the likelihood, for errors are flat far from their minimum.  [default:"
-    " where the objective is of errors alone]",
+    help="First steps on the likelihood, since errors are flat far from their minimum.  [default: if the"
+    " objective has errors alone]",
 )
 @click.option(
     "--state",
     type=click.Path(path_type=Path),
-    help="Keep the state of the tuning in this file after each step; if it is there, go on from it. Folds"
-    " have files of their own beside it.",
+    help="File for the state of the tuning after each step; a stopped tuning goes on from it. Folds have"
+    " files of their own next to it.",
 )
 @folds_option
-@beside_option
+@baselines_option
 @static_option
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("tuned"), show_default=True
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("tuned"),
+    show_default=True,
+    help="Output folder.",
 )
 @overwrite_option
 @json_option
@@ -170,7 +192,7 @@ def tune(
     own: tuple[str, ...],
     spec: Path | None,
     axes: str | None,
-    optimiser: Literal["lbfgs", "fisher", "adam"],
+    optimiser: str,
     starts: int,
     batch: int | None,
     seed: int,
@@ -179,11 +201,11 @@ def tune(
     burn_in: float,
     rescale: bool | None,
     smooth: bool,
-    judge: bool,
+    confidence_intervals: bool,
     warm: bool | None,
     state: Path | None,
     folds: int | None,
-    beside: tuple[str, ...],
+    baselines: tuple[str, ...],
     static: Path | None,
     output: Path,
     overwrite: bool,
@@ -191,54 +213,52 @@ def tune(
 ) -> None:
     """Tune on RUNS and write noise.toml, calibration.toml, and tuning.json for jaxekf report.
 
-    --noise gives the start; the model's defaults otherwise. --folds first shows how well such a tuning does
-    on runs that it has not seen.
+    The start is --noise, or the model's defaults. --folds first shows the errors on held-out runs.
     """
-    check_folds(folds, beside, static)
+    check_folds(folds, baselines, static)
     chosen = get_model(model)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
     aim = parse(objective)
     training = load_runs(runs, sort=sort, model=chosen)
-    judging = load_runs(validate, sort=sort, model=chosen)
-    asked = [*free, *(read_free(spec) if spec else ())]
-    asked += [tuning.Free(name, each_run=True) for name in own]
-    for run in training + judging if aim.needs_truth else ():
+    validation = load_runs(validate, sort=sort, model=chosen)
+    chosen_free = [*free, *(read_free(spec) if spec else ())]
+    chosen_free += [tuning.Free(name, each_run=True) for name in own]
+    for run in training + validation if aim.needs_truth else ():
         if run.encoder is None:
             note(f"run '{run.name}' has no encoder and does not count in the error")
     options: dict[str, Any] = {
-        "validate": judging,
+        "validate": validation,
         "model": chosen,
         "objective": aim,
-        "free": asked or None,
+        "free": chosen_free or None,
         "start": start,
         "axes": axes,
-        "optimiser": optimiser,
+        "optimiser": from_name(optimiser, batch),
         "starts": starts,
-        "batch": batch,
         "seed": seed,
         "iterations": iterations,
         "patience": patience,
         "burn_in_s": burn_in,
         "rescale": rescale,
         "smooth": smooth,
-        "judge": judge,
+        "confidence_intervals": confidence_intervals,
         "warm": aim.errors_alone and optimiser != "adam" if warm is None else warm,
     }
     unseen = None
     if folds is not None:
-        asked_beside = {"beside": beside, "static": static, "checkpoint": state}
-        unseen = held_out(training, folds, **asked_beside, **options)
+        compared = {"baselines": baselines, "static": static, "checkpoint": state}
+        unseen = held_out(training, folds, **compared, **options)
         if not as_json:
             print_folds(unseen)
     with memory.for_runs([run.name for run in training]), tuning_progress(iterations) as progress:
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
-    tuned.save(output, folds=unseen)
+    tuning.save(tuned, output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
         tuning.forget_folds(state)
     _note(tuned, output)
-    scored = [run for run in judging or training if run.encoder is not None]
-    theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if judging else {}
+    scored = [run for run in validation or training if run.encoder is not None]
+    theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if validation else {}
     rows = _compare(tuned, scored, start, theirs, smooth) if scored else []
     tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
@@ -247,26 +267,26 @@ def tune(
         document |= {} if unseen is None else {"folds": unseen.as_dict()}
         print_json(document | _known(tuned))
         return
-    _print(tuned, rows, "validation runs" if judging else "the training runs")
+    _print(tuned, rows, "validation runs" if validation else "the training runs")
 
 
-def _print(tuned: tuning.Tuned, rows: list[tuning.Row], judged: str) -> None:
+def _print(tuned: tuning.Tuned, rows: list[tuning.Row], runs: str) -> None:
     """The tables of a tuning."""
     _print_noise(tuned)
     _print_starts(tuned)
     _print_known(tuned)
     if rows:
-        print_comparison(f"On {judged}", rows)
+        print_comparison(f"On {runs}", rows)
 
 
 def _note(tuned: tuning.Tuned, output: Path) -> None:
-    """Where it is, how it ended, and what to know of it."""
+    """Print the output folder, the end of the search, and unobservable parameters."""
     wrote(output / "noise.toml")
     note(f"{tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
     for label, more in tuned.open.items():
-        note(f"the data leave {label} open, so that it stays at its start: {more} would tell it")
+        note(f"{label} is unobservable and keeps its initial value: {more} would determine it")
 
 
 def _compare(
@@ -276,14 +296,14 @@ def _compare(
     found: dict[str, Parameters],
     smooth: bool,
 ) -> list[tuning.Row]:
-    """Start and tuned parameters beside each other; `found` are those of held-out runs, by name."""
+    """Scores of start and tuned parameters; `found` are those of held-out runs, by name."""
     own = [found.get(run.name, tuned.of_run(run)) for run in runs]
     variants = {"start": start, "tuned": own}
     return tuning.compare(tuned.model, runs, variants, smooth=smooth).rows
 
 
 def _known(tuned: tuning.Tuned) -> dict[str, Any]:
-    """For JSON: intervals, what was left open, starts, what each run has of its own, the truth's frame."""
+    """Intervals, unobservable numbers, starts, runs' own parameters, and the truth's frame, for JSON."""
     each = {name: parameters.to_document(tuned.model, p, {}) for name, p in tuned.each.items()}
     truth = None
     if tuned.truth is not None:
@@ -293,14 +313,12 @@ def _known(tuned: tuning.Tuned) -> dict[str, Any]:
         "left_open": tuned.open,
         "starts": [one._asdict() for one in tuned.starts],
         "truth": truth,
-        "own": {
-            name: {k: told[k] for k in ("noise", "calibration")} for name, told in each.items()
-        },
+        "own": {name: {k: one[k] for k in ("noise", "calibration")} for name, one in each.items()},
     }
 
 
 def _print_starts(tuned: tuning.Tuned) -> None:
-    """What became of each start, where there were several."""
+    """Print the result of each start, if there were several."""
     if not tuned.starts:
         return
     rows = [
@@ -311,7 +329,7 @@ def _print_starts(tuned: tuning.Tuned) -> None:
 
 
 def _print_known(tuned: tuning.Tuned) -> None:
-    """Value and interval of each number that the data determine, and how far it moved."""
+    """Print value, interval and change of each observable number."""
     if not tuned.intervals:
         return
     first = dict(zip(tuned.layout.labels(), tuned.moved, strict=True))
@@ -319,7 +337,7 @@ def _print_known(tuned: tuning.Tuned) -> None:
     for label, ends in tuned.intervals.items():
         rows.append([label, *(f"{end:.5g}" for end in ends), first[label]])
     print_table(
-        "What is known (SI, before the common scale)",
+        "Confidence intervals (SI, before the common scale)",
         ["number", "tuned", "95 %: from", "to", "moved by"],
         rows,
     )

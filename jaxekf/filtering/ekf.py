@@ -37,6 +37,8 @@ _KEPT: dict[str, What] = {
     "estimates": What(prior=False, cov=True, used=False),
     "means": What(prior=False, cov=False, used=False),
 }
+RUNS_AT_ONCE = blocks.LANES
+"""Number of runs that one processor filters at once."""
 
 
 class Innovation(NamedTuple):

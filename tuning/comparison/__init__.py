@@ -1,4 +1,4 @@
-"""Tunings against other tunings: before and after, held-out folds, baselines, and what each of them cost.
+"""Comparisons of tunings: before and after, held-out folds, baselines, and the work of each.
 
-A new baseline goes into `baselines`.
+Only the command line imports this room. A new baseline goes into `baselines`.
 """

@@ -1,4 +1,4 @@
-"""Noise by Allan deviation alone: a start with what the rest of runs or a static log tells, untuned."""
+"""Noise by Allan deviation alone: sensor noise from static intervals or a static log, without tuning."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,10 +15,10 @@ from jaxekf.recordings.types import Floats, Recording
 
 
 class AllanOnly(NamedTuple):
-    """Parameters that nothing was tuned for."""
+    """Parameters without tuning."""
 
     params: Parameters
-    """The start with the noise that was found, of each axis."""
+    """The start with the noise that was found, for each axis."""
     taken: tuple[str, ...]
     """Names of the noise that was found."""
 
@@ -26,11 +26,11 @@ class AllanOnly(NamedTuple):
 def allan_only(
     model: Model, start: Parameters, runs: Sequence[Recording], log: Recording | None = None
 ) -> AllanOnly:
-    """The start with the noise that the static heads of runs tell, each weighted by how long it rests.
+    """The start with the sensor noise of the runs' initial static intervals, weighted by their duration.
 
-    Of bias walks the run that rests longest alone decides, or a static log where there is one, for a short
-    rest makes them up. What else a log tells is taken from there, and the rest from the runs. A full matrix
-    of the start becomes a diagonal one where its noise is told. Raises `TuningError` where nothing rests.
+    Bias walks come from a static log if there is one, else from the longest interval alone, for a short one
+    shows walks that are not there. A log replaces the runs for all noise that it has. A full matrix of the
+    start becomes diagonal if its noise is replaced. Raises `TuningError` if no run begins at rest.
     """
     own = replace(model, parameters=start)
     heads = [noise for noise in map(_head, runs) if noise is not None]
@@ -52,7 +52,7 @@ def allan_only(
 
 
 def _head(run: Recording) -> StaticNoise | None:
-    """Noise of a run's rest at its start; None where it does not rest."""
+    """Noise of a run's initial static interval; None if it has none."""
     try:
         return static_noise(run)
     except RecordingError:
@@ -60,13 +60,13 @@ def _head(run: Recording) -> StaticNoise | None:
 
 
 def _pooled(model: Model, rests: Sequence[StaticNoise]) -> dict[str, Floats]:
-    """Deviations (3,) by name: mean squares by the length of the rest, walks of the longest."""
-    told = sorted(
+    """Deviations (3,) by name: mean squares by duration, walks of the longest interval."""
+    by_duration = sorted(
         ((rest.imu.duration_s, start_for(model, rest)) for rest in rests), key=lambda one: -one[0]
     )
     found: dict[str, Floats] = {}
-    for name in dict.fromkeys(name for _, start in told for name in start.taken):
-        able = told[:1] if "walk" in name else told
+    for name in dict.fromkeys(name for _, start in by_duration for name in start.taken):
+        able = by_duration[:1] if "walk" in name else by_duration
         having = [(s, start) for s, start in able if name in start.taken]
         if having:
             values = np.array([getattr(start.params.noise, name) for _, start in having])
@@ -76,5 +76,5 @@ def _pooled(model: Model, rests: Sequence[StaticNoise]) -> dict[str, Floats]:
 
 
 def _like(value: Floats, before: Any) -> Any:
-    """Deviations as a diagonal factor where the start has a full one."""
+    """Deviations, as a diagonal factor if the start has a full one."""
     return jnp.diag(jnp.asarray(value)) if jnp.ndim(before) == 2 else jnp.asarray(value)

@@ -1,5 +1,4 @@
-"""What a tuning is set beside on the same runs: noise by Allan deviation alone, and searches without
-gradients."""
+"""Baselines of a tuning: noise by Allan deviation alone, and searches without gradients."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,23 +13,23 @@ from jaxekf.estimation.parameters import leaf_names
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Recording
 from tuning.comparison.allan_only import allan_only
-from tuning.comparison.cost import Work
 from tuning.parametrisation.free_vector import Layout, Leaf
-from tuning.persistence.fold_checkpoint import Kept, pack_found, unpack_found
-from tuning.results import Fit, Fitted
-from tuning.search.derivative_free import Found, Problem, Searched
+from tuning.persistence.fold_checkpoint import FoldCheckpoint, pack_found, unpack_found
+from tuning.results.fitted import FittedParameters
+from tuning.results.searched import Found, Searched
+from tuning.search.derivative_free import Problem
 
-BESIDE = ("allan", "coordinates", "nelder-mead")
+BASELINES = ("allan", "coordinates", "nelder-mead")
 
 
-def ordered(beside: Sequence[str]) -> list[str]:
-    """What is asked for in the order of `BESIDE`. Raises `TuningError` for what is none of it."""
-    unknown = [name for name in beside if name not in BESIDE]
-    if isinstance(beside, str) or unknown:
+def ordered(baselines: Sequence[str]) -> list[str]:
+    """Baselines in the order of `BASELINES`. Raises `TuningError` for an unknown one."""
+    unknown = [name for name in baselines if name not in BASELINES]
+    if isinstance(baselines, str) or unknown:
         raise TuningError(
-            f"got {beside!r} to set beside a tuning, expected a list of some of {BESIDE}; choose of these"
+            f"got the baselines {baselines!r}, expected a list of some of {BASELINES}; choose of these"
         )
-    return [name for name in BESIDE if name in beside]
+    return [name for name in BASELINES if name in baselines]
 
 
 def by_allan(
@@ -39,26 +38,26 @@ def by_allan(
     layout: Layout,
     runs: Sequence[Recording],
     log: Recording | None,
-) -> Fit:
-    """The start with the noise that the runs' static heads, or a static log, tell."""
+) -> FittedParameters:
+    """The start with the sensor noise of the runs' static intervals, or of a static log."""
     params = allan_only(model, start, runs, log).params
     values = dict(zip(leaf_names(params), jax.tree.leaves(params), strict=True))
-    # The truth's leaves are not among them, and no held-out run has any of its own.
+    # Leaves of the encoder are left out: no held-out run has any for itself.
     leaves = [_as(leaf, values[leaf.name]) for leaf in layout.leaves if leaf.name in values]
-    return Fit(model, params, Layout(tuple(leaves)))
+    return FittedParameters(model, params, Layout(tuple(leaves)))
 
 
 def _as(leaf: Leaf, value: Any) -> Leaf:
-    """A leaf for a value that may have another shape: Allan deviation tells each axis."""
+    """A leaf for a value that may have another shape: Allan deviations are those of each axis."""
     kind = "factor" if jnp.ndim(value) == 2 else "log"
     return replace(leaf, shape=jnp.shape(value), kind="linear" if leaf.kind == "linear" else kind)
 
 
 def by_search(
-    name: str, problem: Problem, kept: Kept, sweeps: int, evaluations: int | None
+    name: str, problem: Problem, checkpoint: FoldCheckpoint, sweeps: int, evaluations: int | None
 ) -> Searched:
-    """What a search without gradients comes to, searched for once."""
-    # As many as coordinate search makes where it tries both directions each time.
+    """Result of a search without gradients, from the checkpoint if it is finished."""
+    # As many as coordinate search makes if it tries both directions each time.
     most = 2 * len(problem.start) * sweeps + 1 if evaluations is None else evaluations
     searches = {
         "coordinates": partial(problem.by_coordinates, sweeps),
@@ -69,19 +68,11 @@ def by_search(
         found: Found = searches[name]()
         return pack_found(found, problem.scale(found))
 
-    return unpack_found(kept.once(name, search), problem)
-
-
-def work_of(fitted: Fitted) -> Work:
-    """What a search took; nothing where there was none."""
-    if isinstance(fitted, Searched):
-        return Work(float(fitted.filterings), 0.0)
-    return Work(0.0, 0.0)
+    return unpack_found(checkpoint.once(name, search), problem)
 
 
 def in_one_shape(params: Sequence[Parameters]) -> list[Parameters]:
-    """Parameters of runs with the same shapes throughout, one deviation for all axes told three times
-    where another run has three."""
+    """Parameters of runs in the same shapes: one for all axes is repeated if another run has three."""
 
     def alike(*leaves: Any) -> list[Any]:
         shape = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in leaves))

@@ -1,5 +1,4 @@
-"""What a tuning minimises: errors against the truth, likelihood, priors; and the information at its
-minimum.
+"""Objectives: errors against the truth, likelihood and priors; and the Fisher information at a minimum.
 
 A new objective is a term in `objectives`; `data` holds the runs on the device.
 """

@@ -1,4 +1,4 @@
-"""Whether errors are as large as their covariances say, and the scale that makes them so."""
+"""The scale of all covariances at which the NEES of the attitude matches its degrees of freedom."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -26,8 +26,8 @@ def _nees(model: Model, smooth: bool, every: Parameters, data: Data) -> tuple[Ar
 
 
 def is_open(objective: Objective, groups: Sequence[Data], where: Layout) -> bool:
-    """Whether a fit leaves the common scale open that attitude errors fix: where noise or initial belief
-    is free and the objective is one of errors alone."""
+    """Whether the attitude errors must fix the common scale: noise or initial belief is free, and the
+    objective has errors alone."""
     free = any(leaf.name.startswith(SCALED) for leaf in where.leaves)
     alone = not objective.likelihood and not objective.truth
     return free and alone and "attitude" in groups[0].truth
@@ -41,10 +41,10 @@ def scale(
     *,
     smooth: bool = False,
 ) -> float:
-    """The factor for Q, R and P0 at which the attitude errors match their covariances on average.
+    """Factor on Q, R and P0 at which the attitude errors match their covariances on average.
 
-    Scaling all three leaves the gain, and so the estimate, as it is (where no gate is set). `where` says
-    what each run has of its own; with `smooth` the errors are those of the smoothed estimate.
+    It changes neither the gain nor, without a gate, the estimate. With `smooth` the errors are those of
+    the smoothed estimate.
     """
     if not any("attitude" in d.truth and bool(jnp.any(d.truth["attitude"].judged)) for d in groups):
         raise TuningError(

@@ -19,16 +19,16 @@ _SLOPE_NS = 10_000_000
 
 
 class Truth(NamedTuple):
-    """What an output should have been, and where that is known and judged."""
+    """True values of an output, and the instants at which they are known and judged."""
 
     value: Any
     """(runs, K, S, ...) in the output's space."""
     judged: Any
     """(runs, K, S)."""
     first: Any
-    """(runs, K, S, 3) derivative by time; of an attitude its body rate."""
+    """(runs, K, S, 3) derivative by time; the body rate for an attitude."""
     second: Any
-    """(runs, K, S, 3) derivative of that."""
+    """(runs, K, S, 3) derivative of `first`."""
 
 
 class Data(NamedTuple):
@@ -43,7 +43,7 @@ class Data(NamedTuple):
     counted: Any
     """(runs, K, S) instants past the burn-in, at which the likelihood counts."""
     place: Any
-    """(runs,) place of each run among all that were given."""
+    """(runs,) index of each run among all that were given."""
 
 
 def prepare(
@@ -51,7 +51,7 @@ def prepare(
 ) -> Data:
     """Timelines, initial means and truth of runs, stacked and padded to one length.
 
-    Raises `TuningError` without any run or where truth is needed and none is scored.
+    Raises `TuningError` without any run, or if truth is needed and none is scored.
     """
     recordings, lines = _read(model, runs)
     data = _stack(model, recordings, lines, burn_in_s, range(len(lines)))
@@ -131,7 +131,7 @@ def _stack(
 
 
 def on_host(data: Data) -> Data:
-    """The same as NumPy arrays, to count in without compiling anything."""
+    """The data as NumPy arrays, to count in without compiling anything."""
     return jax.tree.map(np.asarray, data)
 
 
@@ -145,7 +145,7 @@ def _blank(name: str, shape: tuple[int, ...]) -> Any:
 
 
 def _truth(recording: Recording, line: Timeline) -> dict[str, Truth]:
-    """What the encoder knows at every instant of a timeline, and where: attitude, rate, position."""
+    """True attitude, rate and position at every instant of a timeline, and the instants that have them."""
     flat = line.time_ns.reshape(-1)
     encoder = recording.need_encoder()
     at = encoder_at(encoder, flat)
@@ -154,27 +154,29 @@ def _truth(recording: Recording, line: Timeline) -> dict[str, Truth]:
     jerk = _slope(encoder, flat, encoder_rate_at)
     shape = line.time_ns.shape
 
-    def laid(values: Any) -> Any:
+    def shaped(values: Any) -> Any:
         return np.nan_to_num(values).reshape(*shape, values.shape[1])
 
     found = {
-        "attitude": Truth(laid(at.q_ref_body), at.scored.reshape(shape), laid(rate), laid(jerk)),
+        "attitude": Truth(
+            shaped(at.q_ref_body), at.scored.reshape(shape), shaped(rate), shaped(jerk)
+        ),
         # Further derivatives would be mostly noise.
-        "rate": Truth(laid(rate), known.reshape(shape), laid(jerk), np.zeros((*shape, 3))),
+        "rate": Truth(shaped(rate), known.reshape(shape), shaped(jerk), np.zeros((*shape, 3))),
     }
     if at.position is not None:
         there = np.isfinite(at.position).all(axis=1) & at.scored
         speed = encoder_velocity_at(encoder, flat)
         found["position"] = Truth(
-            laid(at.position),
+            shaped(at.position),
             there.reshape(shape),
-            laid(speed),
-            laid(_slope(encoder, flat, encoder_velocity_at)),
+            shaped(speed),
+            shaped(_slope(encoder, flat, encoder_velocity_at)),
         )
     return found
 
 
 def _slope(encoder: Encoder, time_ns: Times, of: Callable[[Encoder, Times], Floats]) -> Floats:
-    """Derivative (N, 3) of what an encoder tells at any time, by central differences."""
+    """Derivative (N, 3) of a function of encoder and time, by central differences."""
     half = _SLOPE_NS
     return (of(encoder, time_ns + half) - of(encoder, time_ns - half)) / (2 * half / NANOSECONDS)

@@ -1,9 +1,9 @@
-"""What the measurements tell of each parameter: Fisher information, intervals, and what is left open.
+"""Fisher information of the measurements, confidence intervals, and unobservable parameters.
 
 The information is the expected one of the innovations, ``e_i' inv(S) e_j + tr(inv(S) S_i inv(S) S_j) / 2``
 summed over all measurements, ``e_i`` and ``S_i`` the derivatives of innovation and covariance by central
 differences of the filter itself: two runs of it for each parameter, all recorded runs side by side. With
-the prior it gives Laplace's approximation of what is known after the tuning.
+the prior it gives Laplace's approximation of the posterior.
 """
 
 from collections.abc import Sequence
@@ -25,24 +25,24 @@ from tuning.parametrisation.free_vector import Layout
 
 _STEP = 1e-3
 OPEN = 0.5
-"""A number of which more than this share of its prior deviation is left is not told by the data."""
+"""Share of its prior deviation above which a posterior deviation makes a number unobservable."""
 _Z95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
 class Information:
-    """What is known of the free numbers of a layout, at one point."""
+    """Fisher information of the free numbers of a layout, at one point."""
 
     layout: Layout
     free: Floats
-    """(n,) where it was taken."""
+    """(n,) point at which it was taken."""
     matrix: Floats
     """(n, n) information of the measurements."""
     score: Floats
     """(n,) gradient of the innovations' log-likelihood."""
 
     def posterior(self, fixed: Flags | None = None) -> Floats:
-        """(n, n) covariance after measurements and prior; zero in what is `fixed`."""
+        """(n, n) covariance given measurements and prior; zero for `fixed` numbers."""
         kept = np.ones(len(self.free), bool) if fixed is None else ~fixed
         precision = self.matrix + np.diag(np.asarray(self.layout.prior) ** -2.0)
         cov = np.zeros_like(precision)
@@ -55,10 +55,10 @@ class Information:
         return np.sqrt(np.diagonal(self.posterior(fixed)))
 
     def open(self, fixed: Flags | None = None) -> Flags:
-        """(n,) what the measurements do not tell, `fixed` included.
+        """(n,) numbers that the measurements do not determine, `fixed` included.
 
-        One after the other, the least known first: of two that only their sum is known of one is enough.
-        What belongs to the encoder is not among them: it is told by the errors, not by the measurements.
+        They are fixed one after the other, the least known first: if only the sum of two is known, one is
+        enough. Numbers of the encoder are left out: they are determined by errors, not by measurements.
         """
         found = np.zeros(len(self.free), bool) if fixed is None else fixed.copy()
         prior = np.asarray(self.layout.prior)
@@ -97,20 +97,20 @@ def of_runs(
 ) -> tuple[Floats, Floats]:
     """Information (runs, m, m) and score (runs, m) of each run in its own numbers, `local` (runs, m).
 
-    With `chosen` only some of the numbers are told of.
+    `chosen` selects some of the numbers.
     """
     flat = where.of_one_run()
 
-    def tell(local: Floats) -> tuple[dict[str, Any], Floats]:
+    def measure(local: Floats) -> tuple[dict[str, Any], Floats]:
         return jax.tree.map(np.asarray, _innovations(model, flat, local, base=base, data=data))
 
-    middle, _ = tell(local)
+    middle, _ = measure(local)
     white, spread, gain = [], [], []
     factors = {name: np.linalg.inv(np.linalg.cholesky(cov)) for name, (_, cov, _) in middle.items()}
     for i in range(local.shape[1]) if chosen is None else chosen:
         step = np.zeros(local.shape[1])
         step[i] = _STEP
-        (ahead, higher), (behind, lower) = tell(local + step), tell(local - step)
+        (ahead, higher), (behind, lower) = measure(local + step), measure(local - step)
         first, second = [], []
         for name, (_, _, used) in middle.items():
             both = used & ahead[name][2] & behind[name][2]
@@ -137,14 +137,14 @@ def _apply(factor: Floats, vectors: Floats) -> Floats:
 def _innovations(
     model: Model, flat: Layout, local: Array, *, base: Parameters, data: Data
 ) -> tuple[dict[str, tuple[Array, Array, Array]], Array]:
-    """Residual, covariance and what was used of each sensor past the burn-in, and each run's likelihood."""
+    """Residual, covariance and mask of each sensor after the burn-in, and each run's log-likelihood."""
     every = jax.vmap(partial(flat.from_free, base=base._replace(setup=())))(local)
     output = run_batch(model, every._replace(setup=data.setup), data, "everything")
     found = {}
-    for name, told in output.innovations.items():
+    for name, innovation in output.innovations.items():
         counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
-        used = told.used & counted[..., None]
-        found[name] = (told.residual, told.cov, used)
+        used = innovation.used & counted[..., None]
+        found[name] = (innovation.residual, innovation.cov, used)
     likelihood = jnp.where(data.counted, output.instants.log_likelihood, 0.0)
     return found, jnp.sum(likelihood, axis=(1, 2))
 
@@ -166,27 +166,27 @@ _MORE = {
 }
 
 
-def what_would_tell(name: str) -> str:
-    """What recordings would determine a parameter, in words."""
+def informative_motion(name: str) -> str:
+    """Recordings that would determine a parameter, in words."""
     return _MORE.get(name, _MORE.get(name.split(".")[0], "longer recordings with more motion"))
 
 
 def interval(layout: Layout, free: Any, sigma: Any) -> list[tuple[float, float, float]]:
     """Value and 95 % interval of each free number, in the parameter's unit.
 
-    Of a logarithm the interval is that of the value itself; below the diagonal of a full matrix it is that
-    of the entry by its row's diagonal one.
+    For a logarithm it is the interval of the value itself; below the diagonal of a full matrix that of the
+    entry divided by the diagonal one of its row.
     """
     found, start = [], 0
     for leaf in layout.leaves:
         for i in range(leaf.size):
             value, half = float(free[start + i]), _Z95 * float(sigma[start + i])
             ends = [value, value - half, value + half]
-            told = [leaf.straight(end, i) for end in ends]
+            values = [leaf.unbounded(end, i) for end in ends]
             if leaf.is_logarithm(i):
-                told = [float(np.exp(end)) for end in told]
+                values = [float(np.exp(end)) for end in values]
             elif leaf.kind == "linear":
-                told = [end * leaf.step for end in told]
-            found.append((told[0], told[1], told[2]))
+                values = [end * leaf.step for end in values]
+            found.append((values[0], values[1], values[2]))
         start += leaf.size
     return found

@@ -1,7 +1,7 @@
-"""What the tuner minimises, as one differentiable number over all runs at once."""
+"""Objectives of the tuner: one differentiable number over all runs at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -19,6 +19,7 @@ from jaxekf.geometry import manifold
 from tuning.objective.data import Data
 from tuning.parametrisation.truth_frame import TruthFrame, corrected
 
+_WEIGHTS = ("likelihood", "truth", "prior")
 _DEGREES_SQUARED = float(np.rad2deg(1.0) ** 2)
 
 
@@ -27,9 +28,8 @@ class Objective:
     """A weighted sum of mean squared errors against truth and of innovation likelihood.
 
     ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``, and the
-    likelihood of the truth and a prior where they have a weight; attitude
-    errors are geodesic angles in degrees, rate errors in deg/s, position errors in mm. Add two objectives
-    to combine them.
+    weighted likelihood of the truth and prior. Attitude errors are geodesic angles in degrees, rate errors
+    in deg/s, position errors in mm. Add two objectives to combine them.
     """
 
     errors: tuple[tuple[str, float], ...] = ()
@@ -38,8 +38,8 @@ class Objective:
     truth: float = 0.0
     """Weight of the likelihood of the true attitude under the estimate."""
     prior: float = 0.0
-    """Weight of the prior (see `Free.prior`), which counts as so many more rows: 1 with a likelihood of 1
-    gives the most probable parameters."""
+    """Weight of the prior (see `Free.prior`), as a number of rows: 1 with a likelihood of 1 gives the most
+    probable parameters."""
     smoothed: bool = False
     """Whether errors are those of the smoothed estimate."""
 
@@ -53,23 +53,14 @@ class Objective:
             )
 
     def __add__(self, other: "Objective") -> "Objective":
-        return Objective(
-            self.errors + other.errors,
-            self.likelihood + other.likelihood,
-            self.truth + other.truth,
-            self.prior + other.prior,
-            self.smoothed or other.smoothed,
-        )
+        sums = {name: getattr(self, name) + getattr(other, name) for name in _WEIGHTS}
+        smoothed = self.smoothed or other.smoothed
+        return Objective(self.errors + other.errors, **sums, smoothed=smoothed)
 
     def __mul__(self, factor: float) -> "Objective":
         scaled = tuple((name, weight * factor) for name, weight in self.errors)
-        return Objective(
-            scaled,
-            self.likelihood * factor,
-            self.truth * factor,
-            self.prior * factor,
-            self.smoothed,
-        )
+        weights = {name: getattr(self, name) * factor for name in _WEIGHTS}
+        return replace(self, errors=scaled, **weights)
 
     __rmul__ = __mul__
 
@@ -105,40 +96,21 @@ def rate_error() -> Objective:
     return Objective((("rate", 1.0),))
 
 
-def position_error() -> Objective:
-    """Mean squared position error, mm^2."""
-    return Objective((("position", 1.0),))
-
-
 def innovation_likelihood() -> Objective:
     """Negative log-likelihood of the innovations, per measured row; needs no truth."""
     return Objective(likelihood=1.0)
 
 
-def truth_likelihood() -> Objective:
-    """Negative log-likelihood of the true attitude under the estimate: error and honesty in one."""
-    return Objective(truth=1.0)
-
-
-def most_probable() -> Objective:
-    """Innovation likelihood and prior: the most probable parameters given what was measured."""
-    return Objective(likelihood=1.0, prior=1.0)
-
-
-def prior() -> Objective:
-    """The prior alone, to be added to others."""
-    return Objective(prior=1.0)
-
-
 NAMED = {
-    "attitude": attitude_error,
-    "rate": rate_error,
-    "position": position_error,
-    "likelihood": innovation_likelihood,
-    "truth": truth_likelihood,
-    "map": most_probable,
-    "prior": prior,
+    "attitude": attitude_error(),
+    "rate": rate_error(),
+    "position": Objective((("position", 1.0),)),
+    "likelihood": innovation_likelihood(),
+    "truth": Objective(truth=1.0),
+    "map": Objective(likelihood=1.0, prior=1.0),
+    "prior": Objective(prior=1.0),
 }
+"""``truth`` is the likelihood of the true attitude, ``map`` gives the most probable parameters."""
 
 
 def parse(text: str) -> Objective:
@@ -147,13 +119,20 @@ def parse(text: str) -> Objective:
     for term in text.split("+"):
         weight, _, name = term.strip().rpartition("*")
         try:
-            total = total + NAMED[name.strip()]() * (float(weight) if weight else 1.0)
+            total = total + NAMED[name.strip()] * (float(weight) if weight else 1.0)
         except (KeyError, ValueError):
             raise TuningError(
                 f"got the objective '{text}', expected a sum of weight*name with the names"
                 f" {sorted(NAMED)}; for instance attitude+0.1*likelihood"
             ) from None
     return total
+
+
+def as_objective(given: Objective | str | None, *, smooth: bool = False) -> Objective:
+    """An objective from itself or its text, the attitude error unless given; of the smoothed estimate with
+    `smooth`."""
+    aim = parse(given) if isinstance(given, str) else given or attitude_error()
+    return replace(aim, smoothed=smooth or aim.smoothed)
 
 
 def shared(params: Parameters, data: Data) -> Parameters:
@@ -197,7 +176,7 @@ def evaluate(
 ) -> Array:
     """The objective of all runs with the same parameters, a scalar with a gradient to each of them.
 
-    Samples of all runs are pooled, so that a longer run weighs more. Where `data` is one group of several,
+    Samples of all runs are pooled, so that a longer run weighs more. If `data` is one group of several,
     `counts` are those of `count` over all groups: the values of the groups then add up to that of all.
     """
     return evaluate_each(model, objective, shared(params, data), data, counts)
@@ -221,17 +200,14 @@ def weights_of(objective: Objective) -> dict[str, float]:
     weights: dict[str, float] = {}
     for name, weight in objective.errors:
         weights[name] = weights.get(name, 0.0) + weight
-    if objective.likelihood:
-        weights["likelihood"] = objective.likelihood
-    if objective.truth:
-        weights["truth"] = objective.truth
-    return weights
+    others = {"likelihood": objective.likelihood, "truth": objective.truth}
+    return weights | {name: weight for name, weight in others.items() if weight}
 
 
 def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
-    """What each term is the mean over: judged instants, and for the likelihood visible rows.
+    """Number of samples that each term is the mean over: judged instants, visible rows for the likelihood.
 
-    Of NumPy arrays (`tuning.objective.data.on_host`) it compiles nothing.
+    With NumPy arrays (`tuning.objective.data.on_host`) nothing is compiled.
     """
     found = {}
     for name in names:
@@ -242,17 +218,6 @@ def count(data: Data, names: Sequence[str]) -> dict[str, Array]:
         elif name in data.truth:
             found[name] = data.truth[name].judged.sum()
     return found
-
-
-def terms(
-    model: Model,
-    params: Parameters,
-    data: Data,
-    names: tuple[str, ...],
-    counts: dict[str, Array] | None = None,
-) -> dict[str, Array]:
-    """As `terms_each`, with the same parameters for all runs."""
-    return terms_each(model, shared(params, data), data, names, counts)
 
 
 def terms_each(
@@ -266,7 +231,7 @@ def terms_each(
 ) -> dict[str, Array]:
     """Single terms of an objective, unweighted, from one run of the filter.
 
-    An output's name stands for its mean squared error, ``likelihood`` for the negative mean log-likelihood
+    An output's name is its mean squared error, ``likelihood`` for the negative mean log-likelihood
     of a measured row, ``truth`` for that of the true attitude under the estimate. `counts` is as in
     `evaluate`.
     """
@@ -305,7 +270,7 @@ def _truth_unlikelihood(
 def error_and_covariance(
     model: Model, every: Parameters, output: ekf.FilterOutput, data: Data
 ) -> tuple[Array, Array]:
-    """Attitude errors (runs, K, S, 3) and their covariances; the identity where nothing is judged."""
+    """Attitude errors (runs, K, S, 3) and their covariances; the identity at other instants."""
     error = output_error(model, every, output, data, "attitude")
     _, cov = evaluate_outputs(model, every, output)["attitude"]
     judged = data.truth["attitude"].judged

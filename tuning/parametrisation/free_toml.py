@@ -1,4 +1,4 @@
-"""What is free, from a short TOML file."""
+"""Free parameters from a TOML file."""
 
 import tomllib
 from pathlib import Path
@@ -7,13 +7,18 @@ from typing import Any
 from jaxekf._support.errors import TuningError
 from tuning.parametrisation.free_vector import Free
 
-_KEYS = {"name": str, "each_run": bool, "prior": (int, float), "bounds": list}
+_KEYS = {
+    "name": (str, "the name of a parameter"),
+    "each_run": (bool, "true or false"),
+    "prior": (int | float, "a standard deviation"),
+    "bounds": (list, "two numbers in brackets"),
+}
 
 
 def read_free(path: Path | str) -> list[Free]:
-    """The ``[[free]]`` tables of a file, each with ``name`` and maybe ``each_run``, ``prior``, ``bounds``.
+    """The ``[[free]]`` tables of a file: ``name`` and optional ``each_run``, ``prior`` and ``bounds``.
 
-    Raises `TuningError` for a file that is not so.
+    Raises `TuningError` for a file that has anything else.
     """
     try:
         document = tomllib.loads(Path(path).read_text("utf-8-sig"))
@@ -38,10 +43,10 @@ def _entry(path: Path | str, number: int, table: Any) -> Free:
             " correct the keys"
         )
     for key, value in table.items():
-        wrong = isinstance(value, bool) != (_KEYS[key] is bool)
-        if wrong or not isinstance(value, _KEYS[key]):
+        kind, words = _KEYS[key]
+        if isinstance(value, bool) != (kind is bool) or not isinstance(value, kind):
             raise TuningError(
-                f"{place}: got {key} = {value!r}, expected {_describe(key)}; correct the value"
+                f"{place}: got {key} = {value!r}, expected {words}; correct the value"
             )
     bounds = table.get("bounds")
     if bounds is not None:
@@ -53,12 +58,3 @@ def _entry(path: Path | str, number: int, table: Any) -> Free:
             )
         bounds = (float(bounds[0]), float(bounds[1]))
     return Free(table["name"], table.get("each_run", False), table.get("prior"), bounds)
-
-
-def _describe(key: str) -> str:
-    return {
-        "name": "the name of a parameter",
-        "each_run": "true or false",
-        "prior": "a standard deviation",
-        "bounds": "two numbers in brackets",
-    }[key]

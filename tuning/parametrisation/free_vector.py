@@ -18,7 +18,7 @@ from jaxekf._support.errors import TuningError
 from jaxekf.estimation.parameters import as_arrays, leaf_names
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Floats
-from tuning.parametrisation.truth_frame import TRUTH_UNITS
+from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
 
 # A step of one in the free vector changes a leaf of calibration or truth by this much, by its unit.
 _NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
@@ -32,37 +32,37 @@ _INSIDE = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class Free:
-    """A parameter that may change, and what is known of it beforehand."""
+    """A free parameter, with its prior and bounds."""
 
     name: str
     """A leaf such as ``noise.optical`` or ``calibration.clock_offset``, or a section such as ``noise``."""
     each_run: bool = False
-    """Whether each run has its own; else all share one."""
+    """Whether it is estimated separately for each run."""
     prior: float | None = None
     """Standard deviation about the start: of the logarithm for noise and initial belief, else in the
-    parameter's unit. None is weak: a factor of ten, 50 ms, 0.1 rad, 5 %, 5 cm, 200 ppm."""
+    parameter's unit. None is a weak prior: a factor of ten, 50 ms, 0.1 rad, 5 %, 5 cm, 200 ppm."""
     bounds: tuple[float, float] | None = None
-    """Between which it stays, in its unit; not for full matrices of noise."""
+    """Bounds in its unit; not for full matrices of noise."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One free leaf: where it stands, its shape, and how it is parametrised."""
+    """One free leaf: its name, its shape, and its parametrisation."""
 
     name: str
     shape: tuple[int, ...]
-    """Of one run's value."""
+    """Shape of one run's value."""
     kind: str
     """`log`, `factor` or `linear`."""
     step: float = 1.0
     runs: int = 0
-    """Number of runs that each have their own; 0 where all share one."""
+    """Number of runs that each have their own value; 0 if all share one."""
     prior: float = _WEAK_LOG
     """Standard deviation of a free number about its start."""
     bounds: tuple[float, float] | None = None
-    """Of the free number before `_bend`."""
+    """Bounds of the free number before `_bend`."""
     middle: tuple[float, ...] = ()
-    """With bounds: where the numbers of one run start, and where `_bend` changes nothing."""
+    """With bounds: initial free numbers of one run, at which `_bend` changes nothing."""
 
     @property
     def each(self) -> int:
@@ -85,7 +85,7 @@ class Leaf:
         return jax.vmap(self._free)(every).reshape(-1)
 
     def from_free(self, free: Array) -> Array:
-        """Value of free numbers, with the runs on the first axis where each has its own."""
+        """Value of free numbers, with the runs on the first axis if each has its own."""
         if not self.runs:
             return self._value(free)
         return jax.vmap(self._value)(free.reshape(self.runs, self.each))
@@ -95,8 +95,8 @@ class Leaf:
         diagonal = self.kind == "factor" and number % self.each < self.shape[0]
         return self.kind == "log" or diagonal
 
-    def straight(self, free: float, number: int) -> float:
-        """One of its free numbers before it was kept between its bounds."""
+    def unbounded(self, free: float, number: int) -> float:
+        """One of its free numbers as it is between its bounds."""
         if self.bounds is None:
             return float(free)
         middle = np.asarray(self.middle[number % self.each])
@@ -128,8 +128,8 @@ class Leaf:
 
 
 def _bend(free: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
-    """Any number to one between the bounds; at the start it stays what it is, and its slope is one there,
-    so that steps, priors and intervals mean the same with bounds as without."""
+    """Map any number to one between the bounds. The start is mapped to itself with a slope of one, so that
+    steps, priors and intervals mean the same with bounds as without."""
     if bounds is None:
         return free
     middle, half, at, reach = _curve(bounds, start)
@@ -141,13 +141,13 @@ def _unbend(bent: Array, bounds: tuple[float, float] | None, start: Floats) -> A
         return bent
     begin = jnp.asarray(start)
     middle, half, at, reach = _curve(bounds, start)
-    # Covariances that are scaled to the errors may leave the bounds: then as near to them as can be.
+    # Covariances that are scaled to the errors may leave the bounds; then the nearest point is taken.
     inside = jnp.clip((bent - middle) / half, -_INSIDE, _INSIDE)
     return begin + reach * (jnp.arctanh(inside) - at)
 
 
 def _curve(bounds: tuple[float, float], start: Floats) -> tuple[float, float, Floats, Floats]:
-    """Middle and half width of what lies between the bounds, where on the curve the start lies, and the
+    """Middle and half width of the interval between the bounds, position of the start on the curve, and the
     free distance that is one there."""
     middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     share = np.clip((start - middle) / half, -_INSIDE, _INSIDE)
@@ -169,7 +169,7 @@ class Layout:
 
     @property
     def own(self) -> frozenset[str]:
-        """Names of the leaves of which each run has its own."""
+        """Names of the leaves that each run has for itself."""
         return frozenset(leaf.name for leaf in self.leaves if leaf.runs)
 
     @property
@@ -191,7 +191,7 @@ class Layout:
 
     @property
     def own_of_one_run(self) -> Any:
-        """Which of the numbers that one run is filtered with are its own, as indices."""
+        """Indices of a run's own numbers among all that it is filtered with."""
         own = np.concatenate([np.full(leaf.each, leaf.runs > 0) for leaf in self.leaves])
         return np.flatnonzero(own)
 
@@ -210,11 +210,10 @@ class Layout:
 
     def for_runs_number(self, runs: int) -> "Layout":
         """The layout for another number of runs."""
-        leaves = (replace(leaf, runs=runs if leaf.runs else 0) for leaf in self.leaves)
-        return Layout(tuple(leaves))
+        return Layout(tuple(replace(leaf, runs=runs if leaf.runs else 0) for leaf in self.leaves))
 
     def index(self, place: Any) -> Any:
-        """(runs, m) where in the free vector the numbers of each run stand, ordered as in `of_one_run`."""
+        """(runs, m) indices of each run's numbers in the free vector, ordered as in `of_one_run`."""
         rows = []
         for run in np.asarray(place):
             row, start = [], 0
@@ -228,7 +227,7 @@ class Layout:
     def of_runs(self, params: Parameters, setup: Any, place: Any) -> Parameters:
         """Parameters of some runs, each leaf with those on its first axis.
 
-        `place` (runs,) says which of the runs that have parameters of their own each is; `setup` has the
+        `place` (runs,) is the index of each run among those with parameters of their own; `setup` has the
         runs on the first axis already.
         """
         shared = params._replace(setup=())
@@ -249,8 +248,7 @@ class Layout:
         return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
     def together(self, params: Parameters) -> Parameters:
-        """One set for a run that is none of these: what each run has of its own by its mean, in which
-        deviations are averaged by their logarithms."""
+        """One set for another run: the mean of the runs' own parameters, of logarithms for deviations."""
         kinds = {leaf.name: leaf for leaf in self.leaves if leaf.runs}
         leaves = []
         for name, value in _by_name(params).items():
@@ -262,8 +260,8 @@ class Layout:
         return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
     def from_free(self, free: Array, base: Parameters) -> Parameters:
-        """Parameters with the free leaves of the vector and all others of `base`; those that each run has
-        of its own with the runs on their first axis."""
+        """Parameters with the free leaves of the vector and all others of `base`; leaves that each run has
+        for itself have the runs on their first axis."""
         changed, start = {}, 0
         for leaf in self.leaves:
             changed[leaf.name] = leaf.from_free(free[start : start + leaf.size])
@@ -295,40 +293,42 @@ def layout(
     """The layout of the free leaves; by default all of the noise.
 
     `free` holds leaf names such as ``noise.optical`` or ``calibration.clock_offset``, the name of a
-    whole section, or `Free`; what is named twice is as it is named last. `runs` is the number of runs that
-    may have parameters of their own. Raises `TuningError` for a name that is none, a start outside its
-    domain or bounds, and a prior or bounds that make no sense.
+    whole section, or `Free`; the last entry of a name counts. `runs` is the number of runs that may have
+    parameters of their own. Raises `TuningError` for an unknown name, a start outside its domain or
+    bounds, and an invalid prior or bounds.
     """
     values = _by_name(params)
     units = _by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
     wanted = ["noise"] if free is None else list(free)
     if not wanted:
-        raise TuningError("got nothing that is free, expected some parameters; name noise, for one")
+        raise TuningError(
+            "got nothing that is free, expected some parameters; name noise, for example"
+        )
     chosen: dict[str, Free] = {}
-    for entry in wanted:
-        asked = entry if isinstance(entry, Free) else Free(entry)
-        found = [n for n in units if n == asked.name or n.startswith(f"{asked.name}.")]
+    for given in wanted:
+        entry = given if isinstance(given, Free) else Free(given)
+        found = [n for n in units if n == entry.name or n.startswith(f"{entry.name}.")]
         if not found:
             raise TuningError(
-                f"got the free parameter '{asked.name}', expected some of {list(units)};"
+                f"got the free parameter '{entry.name}', expected some of {list(units)};"
                 " check the spelling"
             )
-        chosen |= dict.fromkeys(found, asked)
+        chosen |= dict.fromkeys(found, entry)
     return Layout(
         tuple(
-            _leaf(name, np.asarray(values[name]), units[name], asked, runs)
-            for name, asked in chosen.items()
+            _leaf(name, np.asarray(values[name]), units[name], entry, runs)
+            for name, entry in chosen.items()
         )
     )
 
 
-def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
+def _leaf(name: str, value: Any, unit: str, entry: Free, runs: int) -> Leaf:
     linear = name.startswith(("calibration.", "truth."))
     step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
     if not linear:
         _check_positive(name, value)
     kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
-    prior = asked.prior
+    prior = entry.prior
     if prior is None:
         prior = _WEAK.get(unit, step) if linear else _WEAK_LOG
     if not 0.0 < prior < np.inf:
@@ -336,19 +336,19 @@ def _leaf(name: str, value: Any, unit: str, asked: Free, runs: int) -> Leaf:
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
             " for a weak one"
         )
-    leaf = Leaf(name, value.shape, kind, step, runs if asked.each_run else 0, prior / step)
-    bounds = _bounds(name, value, kind, step, asked.bounds)
+    leaf = Leaf(name, value.shape, kind, step, runs if entry.each_run else 0, prior / step)
+    bounds = _bounds(name, value, kind, step, entry.bounds)
     if bounds is None:
         return leaf
     numbers = replace(leaf, runs=0).to_free(jnp.asarray(value))
     return replace(leaf, bounds=bounds, middle=tuple(np.asarray(numbers).tolist()))
 
 
-def _bounds(name: str, value: Any, kind: str, step: float, asked: Any) -> Any:
+def _bounds(name: str, value: Any, kind: str, step: float, given: Any) -> Any:
     """Bounds of the free numbers."""
-    if asked is None:
+    if given is None:
         return None
-    low, high = (float(bound) for bound in asked)
+    low, high = (float(bound) for bound in given)
     if not (np.all(low < value) and np.all(value < high)) or kind == "factor":
         got = "a full matrix" if kind == "factor" else f"a start of {value.tolist()}"
         raise TuningError(
@@ -377,7 +377,7 @@ def _check_positive(name: str, value: Any) -> None:
 def with_axes(
     model: Model, params: Parameters, axes: str, free: Sequence[str | Free] | None = None
 ) -> Parameters:
-    """The same noise with one deviation for all axes (`tied`), one for `each`, or a `full` factor.
+    """Noise with one deviation for all axes (`tied`), one for `each`, or a `full` factor.
 
     With `free` (see `layout`) only the leaves that it names are changed.
     """
@@ -402,6 +402,19 @@ def with_axes(
         for name, leaf, dim in zip(names, leaves, dims, strict=True)
     ]
     return as_arrays(params._replace(noise=jax.tree.unflatten(structure, changed)))
+
+
+def initial_parameters(
+    model: Model,
+    start: Parameters | None,
+    free: Sequence[str | Free] | None,
+    axes: str | None,
+) -> Parameters:
+    """Parameters to start a search from, in the shapes that it keeps."""
+    base = as_arrays(model.parameters if start is None else start)
+    if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
+        base = base._replace(truth=no_correction())
+    return base if axes is None else with_axes(model, base, axes, free)
 
 
 SCALED = ("noise.", "initial.")

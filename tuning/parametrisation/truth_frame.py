@@ -1,8 +1,7 @@
-"""How an encoder lies to the tracker it judges: clock, frames and origin, as parameters with a gradient.
+"""Clock, frames and origin of an encoder relative to the tracker, as parameters with a gradient.
 
-An encoder has its own clock and its own frames. Where they are not known they are found with the rest, so
-that an estimate is not blamed, nor bent, for what is wrong with its truth. What was found so is told apart:
-a frame fitted to truth flatters an error that is then counted against it.
+Unknown ones are estimated with the rest, so that a wrong truth neither counts as an error of the estimate
+nor biases its parameters. They are reported separately: errors against a fitted frame are optimistic.
 """
 
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from jaxekf.geometry import rotation
 
 
 class TruthFrame(NamedTuple):
-    """Corrections of an encoder, zero where it is right."""
+    """Corrections of an encoder; zero changes nothing."""
 
     clock_offset: Any
     """Seconds to add to the timeline's time to get the encoder's, within some 20 ms; ()."""
@@ -23,7 +22,7 @@ class TruthFrame(NamedTuple):
     reference: Any
     """Rotation vector that turns the encoder's reference frame into the tracker's, rad; (3,)."""
     origin: Any
-    """Where the encoder's origin is in the tracker's reference frame, m; (3,)."""
+    """Origin of the encoder in the tracker's reference frame, m; (3,)."""
 
 
 TRUTH_UNITS = TruthFrame("s", "rad", "rad", "m")
@@ -35,10 +34,10 @@ def no_correction() -> TruthFrame:
 
 
 def corrected(frame: TruthFrame, name: str, value: Array, first: Array, second: Array) -> Array:
-    """True attitude (w, x, y, z), body rate or position as it is by this frame.
+    """True attitude (w, x, y, z), body rate or position, corrected by a frame.
 
-    `first` and `second` are the derivatives (3,) of the recorded one by time: of an attitude its body rate
-    and that one's derivative.
+    `first` and `second` are the time derivatives (3,) of the recorded value; for an attitude its body rate
+    and the derivative of that.
     """
     late = frame.clock_offset
     turn = rotation.exp(frame.alignment)

@@ -1,4 +1,5 @@
-"""What a tuning leaves on disk: checkpoints of a search and of folds, and `tuning.json` for the report.
+"""Files of a tuning: parameters, `tuning.json` for the report, and checkpoints of a search and of folds.
 
-A new warning about a tuning goes into `_tuning_warnings`.
+`tuning_folder` saves a tuning and `checkpoint` a search; other rooms import these, `tuning_document` and
+`fold_checkpoint`. A new warning about a tuning goes into `_tuning_warnings`.
 """

@@ -1,11 +1,11 @@
-"""What speaks against a tuning, in sentences: of what its record holds, and so of hand-made records too."""
+"""Warnings about a tuning, in sentences, from its record `tuning.json`."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-HONEST_NEES = (0.5, 2.0)
-"""Between which the attitude NEES of a held-out run is taken for honest."""
+CONSISTENT_NEES = (0.5, 2.0)
+"""Range of the attitude NEES of a held-out run with a consistent filter."""
 _FAR_FACTOR = 10.0
 _FAR_SIGMAS = 3.0
 _NEAR_BOUND = 0.01
@@ -19,9 +19,8 @@ _COLUMNS = {
 
 
 def cautions(record: Mapping[str, Any]) -> list[str]:
-    """Sentences on what a reader of `tuning.persistence.tuning_document.record` should know before
-    using the numbers; empty where nothing speaks against them."""
-    judges: tuple[Callable[[Mapping[str, Any]], Iterable[str]], ...] = (
+    """Sentences that a reader of a record should know before using its numbers; empty if there are none."""
+    checks: tuple[Callable[[Mapping[str, Any]], Iterable[str]], ...] = (
         _unseen,
         _ended,
         _left_open,
@@ -29,14 +28,14 @@ def cautions(record: Mapping[str, Any]) -> list[str]:
         _bounded,
         _scaled,
         _worse,
-        _honest,
+        _inconsistent,
     )
-    return [sentence for judge in judges for sentence in judge(record)]
+    return [sentence for check in checks for sentence in check(record)]
 
 
 def before(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The variant that stands for the time before the tuning: ``start``, or the first that is neither the
-    tracker held nor tuned; empty where there is none."""
+    """Name of the variant before the tuning: ``start``, or the first that is neither `hold last` nor tuned;
+    empty if there is none."""
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     others = [name for name in variants if name not in ("hold last", "tuned")]
     return "start" if "start" in variants else others[0] if others else ""
@@ -45,10 +44,10 @@ def before(rows: Sequence[Mapping[str, Any]]) -> str:
 def _unseen(record: Mapping[str, Any]) -> Iterable[str]:
     if record["validation_runs"] or record["folds"] or record["judged_on"] == "other runs":
         return
-    how = "was compared on" if record["rows"] else "was judged by"
+    how = "was compared on" if record["rows"] else "was validated on"
     yield (
-        f"No run was held out: the tuning {how} the training runs themselves, which flatters it; name"
-        " validation runs, or ask for folds"
+        f"No run was held out: the tuning {how} the training runs themselves, whose errors are"
+        " optimistic; name validation runs, or ask for folds"
     )
 
 
@@ -69,8 +68,12 @@ def _left_open(record: Mapping[str, Any]) -> Iterable[str]:
         if number["left_open"]:
             by_motion.setdefault(number["would_tell"], []).append(called(number))
     for motion, names in by_motion.items():
-        what = "it stays at its" if len(names) == 1 else "they stay at their"
-        yield f"The data leave {_listed(names)} open, so that {what} start: {motion} would tell"
+        one = len(names) == 1
+        kept = "it keeps its initial value" if one else "they keep their initial values"
+        which = "it" if one else "them"
+        yield (
+            f"The data do not determine {_listed(names)}, so that {kept}: {motion} would determine {which}"
+        )
 
 
 def _far(record: Mapping[str, Any]) -> Iterable[str]:
@@ -95,7 +98,7 @@ def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
         if bounds is None or value is None:
             continue
         for bound, which in zip(bounds, ("lower", "upper"), strict=True):
-            # Of what may range over decades 1 % of the bound, else 1 % of what lies between both.
+            # For a logarithm 1 % of the bound, else 1 % of the interval between both.
             reach = abs(bound) if number["logarithm"] else bounds[1] - bounds[0]
             if abs(value - bound) <= _NEAR_BOUND * reach:
                 yield (
@@ -126,7 +129,7 @@ def _scaled(record: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _worse(record: Mapping[str, Any]) -> Iterable[str]:
-    for rows, where in _judged(record):
+    for rows, where in _scored(record):
         for name in record["errors"] or ["attitude"]:
             column, head, unit = _COLUMNS[name]
             for run, first, last in _pairs(rows, column):
@@ -138,34 +141,34 @@ def _worse(record: Mapping[str, Any]) -> Iterable[str]:
                     )
 
 
-def _honest(record: Mapping[str, Any]) -> Iterable[str]:
-    low, high = HONEST_NEES
-    for rows, where in _judged(record):
+def _inconsistent(record: Mapping[str, Any]) -> Iterable[str]:
+    low, high = CONSISTENT_NEES
+    for rows, where in _scored(record):
         if where == "training":
             continue
-        told = [
+        outside = [
             f"{row['run']}: {row['nees']:.3g}"
             for row in rows
             if row["variant"] == "tuned"
             and row["nees"] is not None
             and not low <= row["nees"] <= high
         ]
-        if told:
+        if outside:
             yield (
-                f"The attitude's NEES after tuning is outside {low:g} to {high:g} in {_listed(told)}"
+                f"The attitude's NEES after tuning is outside {low:g} to {high:g} in {_listed(outside)}"
                 f" ({where}): there the covariance is not that of the error"
             )
 
 
-def _judged(record: Mapping[str, Any]) -> Iterable[tuple[Sequence[Mapping[str, Any]], str]]:
-    """Rows, and whether their runs were held out or learnt from."""
+def _scored(record: Mapping[str, Any]) -> Iterable[tuple[Sequence[Mapping[str, Any]], str]]:
+    """Rows, and whether their runs were held out or training runs."""
     yield record["rows"], "training" if record["judged_on"] == "training runs" else "held out"
     if record["folds"]:
         yield record["folds"]["rows"], "held out by its fold"
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]], column: str) -> Iterable[tuple[str, float, float]]:
-    """Run and a number of it before and after tuning, where both are known."""
+    """Runs with a number before and after tuning, if both are known."""
     first_of = before(rows)
     found = {(row["run"], row["variant"]): row[column] for row in rows}
     for run in dict.fromkeys(row["run"] for row in rows):

@@ -1,4 +1,4 @@
-"""A tuning that was stopped goes on: the state of its loop in one file, written whole after each step."""
+"""Checkpoint of a search: its state in one file, written atomically after each step."""
 
 import hashlib
 import io
@@ -13,34 +13,35 @@ import numpy as np
 
 from jaxekf._support.errors import TuningError
 from jaxekf.io.atomic import whole_file
-from tuning.search.descent import Descent
-from tuning.search.multistart import Race
+from tuning.search.evaluation import Evaluation
+from tuning.search.multistart import MultiStart
 
-_KIND = "jaxekf tuning, version 3"
+_KIND = "jaxekf tuning, version 4"
 
 
-def attach(race: Race, path: Path, asked: str) -> None:
-    """Keep the state of searches in a file, and go on from there if it is the same searches'.
+def attach(starts: MultiStart, path: Path, options: str) -> None:
+    """Write the state of searches to a file after each step, and go on from the file if it exists.
 
-    `asked` is what else makes it the same. Raises `TuningError` for a file that is not, or no such file.
+    Raises `TuningError` for a file of another search or of other `options`, and for any other file.
     """
-    mark = digest(race.searches[0], asked, race.searches[0].validation)
+    first = starts.searches[0]
+    mark = digest(first, options, first.validation)
     if path.exists():
-        race.restore(read(path, mark))
-    race.keep = partial(write, path, mark)
+        starts.restore(read(path, mark))
+    starts.keep = partial(write, path, mark)
 
 
-def digest(search: Descent, asked: str, more: Any = None) -> str:
-    """Of all that a search depends on, and of more arrays."""
-    told = hashlib.sha256(asked.encode())
-    told.update(repr((search.model.name, search.layout, search.objective)).encode())
-    for leaf in jax.tree.leaves((search.base, search.training, more)):
-        told.update(np.ascontiguousarray(leaf).tobytes())
-    return told.hexdigest()
+def digest(problem: Evaluation, options: str, more: Any = None) -> str:
+    """SHA-256 of all that a search depends on: problem, options, and more arrays."""
+    found = hashlib.sha256(options.encode())
+    found.update(repr((problem.model.name, problem.layout, problem.objective)).encode())
+    for leaf in jax.tree.leaves((problem.base, problem.training, more)):
+        found.update(np.ascontiguousarray(leaf).tobytes())
+    return found.hexdigest()
 
 
 def write(path: Path, mark: str, state: Mapping[str, Any]) -> None:
-    """Write arrays by name as one file, whole or not at all."""
+    """Write arrays by name as one file, atomically."""
     with whole_file(path, overwrite=True) as file:
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, kind=_KIND, mark=mark, **state)
@@ -48,18 +49,18 @@ def write(path: Path, mark: str, state: Mapping[str, Any]) -> None:
 
 
 def read(path: Path, mark: str) -> dict[str, Any]:
-    """What `write` wrote under the same mark. Raises `TuningError` for any other file."""
+    """Arrays that `write` wrote with the same mark. Raises `TuningError` for any other file."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            kept = {name: file[name] for name in file.files}
+            state = {name: file[name] for name in file.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise TuningError(
             f"{path}: got a file that is no state of a tuning ({error}), expected one to go on from, or"
             " none; name another"
         ) from error
-    if str(kept.get("kind")) != _KIND or str(kept.get("mark")) != mark:
+    if str(state.get("kind")) != _KIND or str(state.get("mark")) != mark:
         raise TuningError(
             f"{path}: got the state of another tuning, expected one of the same runs, parameters and"
             " options; remove it, or name another file"
         )
-    return kept
+    return state

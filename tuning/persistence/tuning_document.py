@@ -1,9 +1,9 @@
-"""A tuning as one plain document, `tuning.json`: what a report needs, without runs, model or filter."""
+"""The document `tuning.json`: all that a report of a tuning needs."""
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -12,20 +12,18 @@ from jaxekf._support.errors import TuningError
 from jaxekf.estimation.parameters import leaf_names
 from jaxekf.io.atomic import finite_or_null, write_whole
 from jaxekf.io.run_folder import SCHEMA_VERSION
-from tuning.comparison.compare import Row, as_dicts
 from tuning.objective.fisher_information import interval
 from tuning.parametrisation.free_vector import SCALED, Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
 from tuning.persistence._tuning_warnings import cautions
-
-if TYPE_CHECKING:  # Both come after this module, which `Tuned.save` needs.
-    from tuning._tune import Tuned
-    from tuning.comparison.cross_validation import CrossValidation
+from tuning.results.comparison import Row, as_dicts
+from tuning.results.held_out import CrossValidation
+from tuning.results.tuned import Tuned
 
 FILE = "tuning.json"
 JudgedOn = Literal["validation runs", "training runs", "other runs"]
-"""Which runs are compared; those of neither kind are ``other runs``."""
-_SAID = (
+"""Kind of the compared runs; ``other runs`` took no part in the tuning."""
+_OWN_ENTRY = (
     "runs",
     "validation_runs",
     "objective",
@@ -37,26 +35,25 @@ _SAID = (
     "date",
     "left_open",
 )
-"""What of the origin stands elsewhere in the document."""
+"""Parts of the origin that have an entry of their own in the document."""
 
 
 def record(
-    tuned: "Tuned",
+    tuned: Tuned,
     *,
     rows: Sequence[Row] = (),
     judged_on: JudgedOn | None = None,
-    folds: "CrossValidation | None" = None,
+    folds: CrossValidation | None = None,
 ) -> dict[str, Any]:
-    """A tuning for JSON: SI units, None for what is not known, ``warnings`` in sentences.
+    """A tuning for JSON, in SI units; unknown numbers are None, and ``warnings`` are sentences.
 
-    `rows` are those of `compare` with the variants ``start`` and ``tuned``; `judged_on` says of which runs
-    they are, and is told by their names unless given. `folds` come from `cross_validate`. ``numbers`` holds
-    each free number: ``tuned`` and ``interval`` (95 %) before the common scale of all covariances,
-    ``written`` as it stands in the parameter files; ``change`` is a factor for logarithms, else in
-    deviations of the prior. ``history`` has the values of the objective, step by step, of
-    the best of several ``starts``.
+    `rows` come from `compare` with the variants ``start`` and ``tuned``, `folds` from `cross_validate`.
+    `judged_on` is the kind of the rows' runs, found by their names unless given. ``numbers`` holds each
+    free number: ``tuned`` and ``interval`` (95 %) before the common scale, ``written`` as in the parameter
+    files; ``change`` is a factor for logarithms, else in prior deviations. ``history`` has
+    the values of the objective, step by step, for the best of several ``starts``.
 
-    Raises `TuningError` where `judged_on` contradicts the names of the runs.
+    Raises `TuningError` if `judged_on` contradicts the names of the runs.
     """
     origin = tuned.origin
     found: dict[str, Any] = {
@@ -68,7 +65,7 @@ def record(
         "runs": list(origin.get("runs", [])),
         "validation_runs": list(origin.get("validation_runs", [])),
         "date": origin.get("date"),
-        "provenance": {key: value for key, value in origin.items() if key not in _SAID},
+        "provenance": {key: value for key, value in origin.items() if key not in _OWN_ENTRY},
         "tuning": tuned.digest,
         "inputs": tuned.inputs,
         "stopped": tuned.stopped,
@@ -100,21 +97,44 @@ def record(
 
 def save_record(
     folder: Path | str,
-    tuned: "Tuned",
+    tuned: Tuned,
     *,
     rows: Sequence[Row] = (),
     judged_on: JudgedOn | None = None,
-    folds: "CrossValidation | None" = None,
+    folds: CrossValidation | None = None,
 ) -> Path:
-    """Write `record` as `tuning.json` into a folder, whole or not at all; an earlier one is replaced.
+    """Write `tuning.json` into a folder, atomically; an earlier one is replaced.
 
-    Raises `RecordingError` where a folder is of that name, and what `record` raises.
+    Parameters
+    ----------
+    folder
+        Folder of the tuning.
+    tuned
+        The tuning.
+    rows
+        Rows of `compare` with the variants ``start`` and ``tuned``.
+    judged_on
+        Kind of the rows' runs; found by their names unless given.
+    folds
+        Result of `cross_validate`.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    TuningError
+        If `judged_on` contradicts the names of the runs.
+    RecordingError
+        If a folder has the name of the file.
     """
     return write_record(folder, record(tuned, rows=rows, judged_on=judged_on, folds=folds))
 
 
 def write_record(folder: Path | str, document: Mapping[str, Any]) -> Path:
-    """Write what `record` made as `save_record` does."""
+    """Write a document of `record` as `save_record` does."""
     text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
     file = Path(folder) / FILE
     write_whole(file, text + "\n")
@@ -122,7 +142,7 @@ def write_record(folder: Path | str, document: Mapping[str, Any]) -> Path:
 
 
 def _plain(node: Any) -> Any:
-    """A document without arrays and numbers of NumPy."""
+    """Replace arrays and numbers of NumPy by plain ones."""
     if isinstance(node, Mapping):
         return {str(key): _plain(value) for key, value in node.items()}
     if isinstance(node, list | tuple):
@@ -132,7 +152,7 @@ def _plain(node: Any) -> Any:
     return str(node) if isinstance(node, Path) else node
 
 
-def _judged_on(tuned: "Tuned", rows: Sequence[Row], said: JudgedOn | None) -> JudgedOn | None:
+def _judged_on(tuned: Tuned, rows: Sequence[Row], given: JudgedOn | None) -> JudgedOn | None:
     names = {row.run for row in rows}
     if not names:
         return None
@@ -141,23 +161,23 @@ def _judged_on(tuned: "Tuned", rows: Sequence[Row], said: JudgedOn | None) -> Ju
         kind = "training runs"
     elif names & set(tuned.origin.get("validation_runs", [])):
         kind = "validation runs"
-    if said is not None and said != kind:
+    if given is not None and given != kind:
         raise TuningError(
-            f"got rows judged on '{said}' of {sorted(names)}, expected '{kind}' as the runs of the tuning"
-            " say; compare other runs, or leave judged_on out"
+            f"got rows judged on '{given}' of {sorted(names)}, expected '{kind}' by the runs of the"
+            " tuning; compare other runs, or leave judged_on out"
         )
     return kind
 
 
-def _units(tuned: "Tuned") -> dict[str, str]:
+def _units(tuned: Tuned) -> dict[str, str]:
     """The unit of each free parameter, by its name."""
     every = tuned.model.units._replace(truth=TRUTH_UNITS)
     units = dict(zip(leaf_names(every), jax.tree.leaves(every), strict=True))
     return {leaf.name: units[leaf.name] for leaf in tuned.layout.leaves}
 
 
-def _also_scaled(tuned: "Tuned") -> list[str]:
-    """Noise and initial belief that were not free, where the common scale changed them."""
+def _also_scaled(tuned: Tuned) -> list[str]:
+    """Noise parameters that were not free and that the common scale changed."""
     if tuned.scale == 1.0:
         return []
     free = {leaf.name for leaf in tuned.layout.leaves}
@@ -166,8 +186,8 @@ def _also_scaled(tuned: "Tuned") -> list[str]:
     ]
 
 
-def _truth(tuned: "Tuned") -> dict[str, Any] | None:
-    """How the encoder lies to the tracker, where that was free."""
+def _truth(tuned: Tuned) -> dict[str, Any] | None:
+    """Clock and frames of the encoder, if they were free."""
     if tuned.truth is None:
         return None
     units = TRUTH_UNITS._asdict()
@@ -177,20 +197,20 @@ def _truth(tuned: "Tuned") -> dict[str, Any] | None:
     }
 
 
-def _numbers(tuned: "Tuned") -> list[dict[str, Any]]:
-    """Each free number: where it began, where it ended, and how well it is known."""
+def _numbers(tuned: Tuned) -> list[dict[str, Any]]:
+    """Each free number: start, tuned value, and confidence interval."""
     where, units = tuned.layout, _units(tuned)
     labels, moved = where.labels(), tuned.moved
     start, end = np.asarray(where.to_free(tuned.start)), np.asarray(tuned.free)
     first = interval(where, start, np.zeros(len(start)))
     last = interval(where, end, np.zeros(len(end)))
-    known, told, runs = tuned.intervals, tuned.open, tuned.origin.get("runs", [])
+    known, unknown, runs = tuned.intervals, tuned.open, tuned.origin.get("runs", [])
     found, at = [], 0
     for leaf in where.leaves:
         for i in range(leaf.size):
             label, logarithm = labels[at], leaf.is_logarithm(i)
             run = i // leaf.each
-            change = leaf.straight(end[at], i) - leaf.straight(start[at], i)
+            change = leaf.unbounded(end[at], i) - leaf.unbounded(start[at], i)
             scales = logarithm and leaf.name.startswith(SCALED)
             ends = known.get(label)
             found.append(
@@ -207,8 +227,8 @@ def _numbers(tuned: "Tuned") -> list[dict[str, Any]]:
                     "written": last[at][0] * (np.sqrt(tuned.scale) if scales else 1.0),
                     "moved": moved[at],
                     "change": float(np.exp(change)) if logarithm else change / leaf.prior,
-                    "left_open": label in told,
-                    "would_tell": told.get(label),
+                    "left_open": label in unknown,
+                    "would_tell": unknown.get(label),
                     "bounds": _bounds(leaf),
                 }
             )

@@ -1,4 +1,6 @@
-"""How a tuning searches: descent with L-BFGS, Fisher scoring or optax, minibatches, several starts.
+"""Searches for the best parameters: L-BFGS, Fisher scoring, optax, minibatches, several starts, and
+searches without gradients.
 
-`optimisers` has the objects a user passes. A new optimiser is a class there and its step in `descent`.
+`tuning.tuner` and `tuning.persistence` import `evaluation`, `descent`, `multistart`, `optimisers` and
+`derivative_free`. A new optimiser is a class in `optimisers`.
 """

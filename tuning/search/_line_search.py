@@ -1,4 +1,4 @@
-"""Where an optimiser stands and where it looks next, one evaluation at a time."""
+"""Line search along the direction of an optimiser, one evaluation at a time."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -15,19 +15,19 @@ _LONGEST_STEP = 1.0
 _LBFGS = optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
 # Not compiled as a whole it is some eighty programs, two of which are compiled anew at each step.
 _lbfgs_begin, _lbfgs_step = jax.jit(_LBFGS.init), jax.jit(_LBFGS.update)
-_KEPT = ("candidate", "stand", "value", "gradient", "change", "rejections", "small_gains")
+_STATE = ("candidate", "accepted", "value", "gradient", "change", "rejections", "small_gains")
 
 
-class Walk:
-    """Where the optimiser stands and where it looks next.
+class LineSearch:
+    """The last accepted point of a search, and the next candidate.
 
-    The default is L-BFGS with backtracking: the direction is optax's, a step is halved until the
-    objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). An
-    optax optimiser of the caller's own is followed as it is, but for steps that are not finite; a
-    `direction` of where it stands and the gradient there takes the place of L-BFGS's. Two gains in a row
-    of less than `least`, by default a small part of the value, end it.
+    The default is L-BFGS with backtracking: optax gives the direction, a step is halved until the
+    objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). The
+    steps of another optax optimiser are taken as they are, unless they are not finite. A `direction`, a
+    function of the accepted point and its gradient, replaces that of L-BFGS. Two gains in a row of less
+    than `least`, by default a small part of the value, end the search.
 
-    All but the optimiser's own arithmetic is done on the host: for a few numbers it is not worth a program.
+    Only the optimiser's own arithmetic is compiled: the rest, of a few numbers, is done on the host.
     """
 
     def __init__(
@@ -44,13 +44,13 @@ class Walk:
         )
         free = np.asarray(free)
         self.state = begin(jax.device_put(free))
-        self.candidate = self.stand = free
+        self.candidate = self.accepted = free
         self.value = float("inf")
         self.gradient = self.change = np.zeros_like(free)
         self.rejections = self.small_gains = 0
 
     def move(self, value: float, gradient: Floats, finite: bool) -> str:
-        """Take or refuse the candidate and choose the next; a reason to stop, or nothing."""
+        """Accept or reject the candidate and choose the next; return a reason to stop or ''."""
         if not finite or (self.monotone and not self._falls(value)):
             self.rejections += 1
             if self.rejections >= _MOST_REJECTIONS:
@@ -60,7 +60,7 @@ class Walk:
                     else f"{_MOST_REJECTIONS} steps in a row failed"
                 )
             self.change = (0.5 if finite else 0.25) * self.change
-            self.candidate = self.stand + self.change
+            self.candidate = self.accepted + self.change
             return ""
         relative = _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
         small = self.value - value < (relative if self.least is None else self.least)
@@ -68,13 +68,13 @@ class Walk:
         if self.small_gains >= 2:
             return "converged"
         self.rejections = 0
-        self.stand, self.value, self.gradient = self.candidate, value, gradient
+        self.accepted, self.value, self.gradient = self.candidate, value, gradient
         if self.direction is None:
-            given = jax.device_put((gradient, self.state, self.stand))
+            given = jax.device_put((gradient, self.state, self.accepted))
             update, self.state = self._step(*given)
             self.change = np.asarray(update)
         else:
-            self.change = self.direction(self.stand, gradient)
+            self.change = self.direction(self.accepted, gradient)
         if self.monotone:
             if float(self.change @ gradient) >= 0.0:
                 self.change = -gradient
@@ -82,24 +82,24 @@ class Walk:
             if longest == 0.0:
                 return "converged"
             self.change = self.change * min(1.0, _LONGEST_STEP / longest)
-        self.candidate = self.stand + self.change
+        self.candidate = self.accepted + self.change
         return ""
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a walk goes on from, as arrays by name."""
-        found: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _KEPT}
+        """State as arrays by name."""
+        found: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _STATE}
         leaves = jax.tree.leaves(self.state)
         return found | {f"state_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
 
-    def restore(self, kept: Mapping[str, Any]) -> None:
-        """Go on from where `state_dict` was taken."""
-        for name in _KEPT:
-            value = kept[name]
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from the state that `state_dict` returned."""
+        for name in _STATE:
+            value = state[name]
             plain = {"value": float, "rejections": int, "small_gains": int}
             setattr(self, name, plain[name](value) if name in plain else np.asarray(value))
         leaves, structure = jax.tree.flatten(self.state)
         again = [
-            np.asarray(kept[f"state_{i}"], np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)
+            np.asarray(state[f"state_{i}"], np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)
         ]
         self.state = jax.tree.unflatten(structure, again)
 

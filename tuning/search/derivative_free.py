@@ -1,11 +1,10 @@
-"""What is done without a gradient, on the tuner's own objective: coordinate search and Nelder-Mead.
+"""Searches without gradients on the tuner's objective: coordinate search and Nelder-Mead.
 
-Baselines to measure the tuner by, counted in evaluations of the objective: each filters all runs once.
+They are baselines for the tuner. Each evaluation of the objective filters all runs once.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,62 +15,19 @@ from jaxekf.estimation.batch import Run, read, require_float64
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.models import adapted, get_model
 from jaxekf.recordings.types import Flags, Floats
-from tuning._tune import starting
 from tuning.objective import covariance_scale
 from tuning.objective.data import prepare_groups
-from tuning.objective.objectives import Objective, attitude_error, parse
-from tuning.parametrisation.free_vector import Free, Layout, layout, scaled
-from tuning.search.descent import Descent
+from tuning.objective.objectives import Objective, as_objective
+from tuning.parametrisation.free_vector import Free, initial_parameters, layout, scaled
+from tuning.results.searched import Found, Lowered, Searched
+from tuning.search.evaluation import Evaluation
 
 _FIRST_STEP = 0.1
-"""Of a value by itself, and of a number below the diagonal of a full matrix, which is one of its row's
-diagonal."""
+"""First step as a share of a noise parameter; below the diagonal of a full matrix of the row's diagonal."""
 
 
-class Lowered(NamedTuple):
-    """Where a search first found a lower value."""
-
-    evaluations: int
-    """Made until then, this one included."""
-    value: float
-
-
-class Found(NamedTuple):
-    """What a search came to."""
-
-    best: Floats
-    """(n,)"""
-    value: float
-    history: tuple[Lowered, ...]
-    """From the start on, each lower than the one before."""
-    evaluations: int
-    """In total."""
-
-
-@dataclass(frozen=True)
-class Searched:
-    """What came out of a tuning without gradients."""
-
-    model: Model
-    params: Parameters
-    """The best, scaled; of what each run has of its own the mean."""
-    value: float
-    """The objective of `params`."""
-    history: tuple[Lowered, ...]
-    evaluations: int
-    """Of the objective, without a gradient."""
-    start: Parameters
-    layout: Layout
-    free: Floats
-    """(n,) the best free vector, before the scale."""
-    scale: float = 1.0
-    """Factor by which all covariances were scaled after the search so that errors match them."""
-    filterings: int = 0
-    """Of all runs: the evaluations, and one more for the scale."""
-
-
-class Asked(TypedDict, total=False):
-    """What is searched for. Defaults and errors are those of `tune`."""
+class SearchOptions(TypedDict, total=False):
+    """Options of a search without gradients. Defaults and errors are those of `tune`."""
 
     model: str | Model
     objective: Objective | str | None
@@ -84,7 +40,7 @@ class Asked(TypedDict, total=False):
 
 
 class _Counted:
-    """A function that keeps its lowest value; one that is not finite is as high as can be."""
+    """A function with the number of its evaluations and its lowest value; not finite counts as infinite."""
 
     def __init__(self, function: Callable[[Floats], float], start: Floats) -> None:
         self.function = function
@@ -122,10 +78,10 @@ def coordinate_search(
 ) -> Found:
     """Lower a function of (n,) numbers by one number at a time (Abbeel et al. 2005; MATLAB's `tune`).
 
-    Each number in turn is tried with its step added, and if that does not lower the value, taken away; what
-    lowers it is kept. Then the number's step is multiplied by `growth`, or by `shrinkage` where neither
-    did. The step of a `relative` number is that share of its value. Raises `TuningError` where the value
-    at the start is not finite, and for less than one sweep.
+    Each number in turn is tried with its step added and, if that does not lower the value, with its step
+    subtracted; a lower value is accepted. Then the number's step is multiplied by `growth`, or by
+    `shrinkage` if neither trial was accepted. The step of a `relative` number is a share of its value.
+    Raises `TuningError` if the value at the start is not finite, and for less than one sweep.
     """
     if sweeps < 1:
         raise TuningError(f"got {sweeps} sweeps, expected at least one; ask for more")
@@ -148,9 +104,9 @@ def nelder_mead(
 ) -> Found:
     """Lower a function of (n,) numbers by SciPy's Nelder-Mead, its coefficients adapted to n.
 
-    The first simplex is the start and, for each number, the start with its step added. It ends after so
-    many evaluations, or when values and simplex agree within 1e-8. Raises `TuningError` where the value at
-    the start is not finite, and for fewer evaluations than the simplex has corners.
+    The first simplex is the start and, for each number, the start with its step added. It ends after
+    `evaluations`, or when values and simplex agree within 1e-8. Raises `TuningError` if the value at the
+    start is not finite, and for fewer evaluations than the simplex has corners.
     """
     start, step = np.asarray(start, float), np.asarray(step, float)
     if evaluations < len(start) + 2:
@@ -175,21 +131,19 @@ def nelder_mead(
 class Problem:
     """The tuner's objective as a function of the free vector, evaluated by the tuner's own program."""
 
-    def __init__(self, runs: Sequence[Run], **asked: Unpack[Asked]) -> None:
+    def __init__(self, runs: Sequence[Run], **options: Unpack[SearchOptions]) -> None:
         require_float64()
-        learnt = read(runs)
-        self.model = adapted(get_model(asked.get("model", "loose")), learnt)
-        told, free = asked.get("objective"), asked.get("free")
-        aim = parse(told) if isinstance(told, str) else told or attitude_error()
-        aim = replace(aim, smoothed=asked.get("smooth", False) or aim.smoothed)
-        self.base = starting(self.model, asked.get("start"), free, asked.get("axes"))
+        learnt, free = read(runs), options.get("free")
+        self.model = adapted(get_model(options.get("model", "loose")), learnt)
+        aim = as_objective(options.get("objective"), smooth=options.get("smooth", False))
+        start, axes = options.get("start"), options.get("axes")
+        self.base = initial_parameters(self.model, start, free, axes)
         self.layout = layout(self.model, self.base, free, len(learnt))
-        burn_in_s = asked.get("burn_in_s", 0.0)
+        burn_in_s = options.get("burn_in_s", 0.0)
         groups = prepare_groups(self.model, learnt, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
-        # It is never stepped: its value is what is searched.
-        self.search = Descent(self.model, aim, self.layout, self.base, groups, None, iterations=0)
-        self.start, self.value = self.search.start, self.search.value
-        rescale = asked.get("rescale")
+        self.evaluation = Evaluation(self.model, aim, self.layout, self.base, groups, None)
+        self.start, self.value = self.evaluation.start, self.evaluation.value
+        rescale = options.get("rescale")
         self.rescale = (
             covariance_scale.is_open(aim, groups, self.layout) if rescale is None else rescale
         )
@@ -201,7 +155,7 @@ class Problem:
 
     @property
     def steps(self) -> Floats:
-        """(n,) first steps; a leaf of calibration has its natural unit as the unit of its free numbers."""
+        """(n,) first steps; the free numbers of calibration are in its natural unit."""
         linear = [leaf.kind == "linear" for leaf in self.layout.leaves for _ in range(leaf.size)]
         return np.where(linear, 1.0, _FIRST_STEP)
 
@@ -213,7 +167,7 @@ class Problem:
             return np.where(relative, np.exp(np.where(relative, free, 0.0)), free)
 
         def back(values: Floats) -> Floats:
-            # A step of more than the whole value leads below zero: no deviation, and no finite objective.
+            # A step of more than the whole value leads below zero, to no deviation and no finite objective.
             admissible = np.where(relative & (values > 0.0), values, 1.0)
             logs = np.where(values > 0.0, np.log(admissible), np.nan)
             return np.where(relative, logs, values)
@@ -232,16 +186,16 @@ class Problem:
         return nelder_mead(self.value, self.start, step=self.steps, evaluations=evaluations)
 
     def scale(self, found: Found) -> float:
-        """By which the covariances of what was found are too small: 1 where nothing is to be scaled."""
+        """Factor by which the covariances at the minimum are too small; 1 if they are not to be scaled."""
         if not self.rescale:
             return 1.0
         params = self.layout.from_free(jnp.asarray(found.best), self.base)
-        smooth = self.search.objective.smoothed
-        given = self.model, params, self.search.training, self.layout
+        smooth = self.evaluation.objective.smoothed
+        given = self.model, params, self.evaluation.training, self.layout
         return covariance_scale.scale(*given, smooth=smooth)
 
     def searched(self, found: Found, scale: float) -> Searched:
-        """What was found as parameters."""
+        """Result of a search as parameters."""
         params = self.layout.from_free(jnp.asarray(found.best), self.base)
         return Searched(
             model=self.model,
@@ -258,24 +212,24 @@ class Problem:
 
 
 def tune_by_coordinates(
-    runs: Sequence[Run], *, sweeps: int = 20, **asked: Unpack[Asked]
+    runs: Sequence[Run], *, sweeps: int = 20, **options: Unpack[SearchOptions]
 ) -> Searched:
     """Tune by `coordinate_search`; the other arguments, defaults and errors are those of `tune`.
 
-    Deviations start with steps of 10 % of their value, numbers below the diagonal of a full matrix with
-    10 % of their row's diagonal one, calibration with its natural unit (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
+    The first steps are 10 % of a deviation, 10 % of the row's diagonal entry below the diagonal of a full
+    matrix, and the natural unit of a calibration (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
     """
-    problem = Problem(runs, **asked)
+    problem = Problem(runs, **options)
     found = problem.by_coordinates(sweeps)
     return problem.searched(found, problem.scale(found))
 
 
 def tune_by_nelder_mead(
-    runs: Sequence[Run], *, evaluations: int = 1_000, **asked: Unpack[Asked]
+    runs: Sequence[Run], *, evaluations: int = 1_000, **options: Unpack[SearchOptions]
 ) -> Searched:
     """Tune by `nelder_mead` on the free vector, in which deviations are logarithms; the other arguments,
     defaults and errors are those of `tune`. The steps of the first simplex are those of
     `tune_by_coordinates`."""
-    problem = Problem(runs, **asked)
+    problem = Problem(runs, **options)
     found = problem.by_nelder_mead(evaluations)
     return problem.searched(found, problem.scale(found))

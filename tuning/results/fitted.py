@@ -1,4 +1,4 @@
-"""What a fit leaves behind that runs it has not seen are estimated with."""
+"""Parameters that were found on some runs and that other runs are estimated with."""
 
 from typing import NamedTuple, Protocol
 
@@ -11,22 +11,22 @@ class Fitted(Protocol):
 
     @property
     def model(self) -> Model:
-        """Whose parameters they are."""
+        """Model that the parameters belong to."""
         ...
 
     @property
     def params(self) -> Parameters:
-        """Of what each run has of its own the mean."""
+        """Parameters; the mean over the runs where each run has its own."""
         ...
 
     @property
     def layout(self) -> Layout:
-        """What was free, and of what each run has its own."""
+        """Free parameters, and which of them each run has for itself."""
         ...
 
 
-class Fit(NamedTuple):
-    """No more than that."""
+class FittedParameters(NamedTuple):
+    """The smallest `Fitted`."""
 
     model: Model
     params: Parameters

@@ -1,0 +1,178 @@
+"""Result of a cross-validation: folds, their spread, and the work that they took."""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxekf._support.deprecations import warn_renamed
+from jaxekf.estimation.parameters import leaf_names
+from jaxekf.filtering.model import Parameters
+from jaxekf.recordings.types import Floats
+from tuning.results.comparison import Row, as_dicts, by_variant
+from tuning.results.fitted import Fitted
+from tuning.results.searched import Searched
+from tuning.results.tuned import Tuned
+
+COLUMNS = tuple(name for name in Row._fields if name not in ("run", "variant"))
+_BEST_AT_ONE = ("nis", "nees", "position_nees")
+
+
+class Work(NamedTuple):
+    """Number of filterings of all training runs."""
+
+    filterings: float
+    """Filterings without a gradient: values, Fisher information (two for each number and one), the scale,
+    and validation runs by their share of the rows."""
+    gradients: float
+    """Filterings with the gradient of the objective."""
+
+    def forward(self, gradient_cost: float) -> float:
+        """Total in filterings without a gradient; one with a gradient counts as `gradient_cost`."""
+        return self.filterings + (gradient_cost * self.gradients if self.gradients else 0.0)
+
+
+def work_of(fitted: Fitted) -> Work:
+    """Work of a tuning or a search; zero for parameters that were not searched for."""
+    if isinstance(fitted, Tuned):
+        return Work(float(fitted.filterings), float(fitted.evaluations))
+    return Work(float(fitted.filterings) if isinstance(fitted, Searched) else 0.0, 0.0)
+
+
+class Fold(NamedTuple):
+    """One tuning, and the runs that it did not learn from."""
+
+    held_out: tuple[str, ...]
+    """Names of runs."""
+    tuned: Tuned
+    baselines: Mapping[str, Fitted] = MappingProxyType({})
+    """Baselines on the same training runs, by variant."""
+
+    @property
+    def beside(self) -> Mapping[str, Fitted]:
+        """Deprecated: `baselines`."""
+        warn_renamed("Fold.beside", "Fold.baselines")
+        return self.baselines
+
+    @property
+    def work(self) -> dict[str, Work]:
+        """Work of each variant, by its name."""
+        every = {**self.baselines, "tuned": self.tuned}
+        return {"start": Work(0.0, 0.0)} | {name: work_of(one) for name, one in every.items()}
+
+
+class Spread(NamedTuple):
+    """Statistics of a column over the runs that have a number there; NaN if there are too few."""
+
+    mean: float
+    deviation: float
+    """Standard deviation of a run, by n - 1."""
+    worst: float
+    """Largest error; for NIS and NEES the number farthest from 1 as a factor."""
+
+
+class ParameterSpread(NamedTuple):
+    """Values of one parameter over the folds, in its unit."""
+
+    start: Floats
+    """In the parameter's shape."""
+    mean: Floats
+    deviation: Floats
+    """Standard deviation of a fold, by n - 1. Two folds share most of their runs; tunings on independent
+    runs would differ by more."""
+    each: Floats
+    """(folds, ...)"""
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Result of `tuning.cross_validate`."""
+
+    rows: list[Row]
+    """Rows of each held-out run in the order given: `hold last`, `start`, and its fold's baselines and
+    `tuned`."""
+    folds: tuple[Fold, ...]
+    gradient_cost: float = float("nan")
+    """Time of the objective with its gradient as a multiple of the time without; NaN without baselines."""
+
+    @property
+    def work(self) -> dict[str, Work]:
+        """Work of each variant by its name, the mean over the folds."""
+        each = [fold.work for fold in self.folds]
+        names = each[0] if each else ()
+        mean = statistics.fmean
+        return {
+            name: Work(*map(mean, zip(*(w[name] for w in each), strict=True))) for name in names
+        }
+
+    @property
+    def forward(self) -> dict[str, float]:
+        """`work` in filterings of all training runs without a gradient; empty without baselines."""
+        if np.isnan(self.gradient_cost):
+            return {}
+        return {name: work.forward(self.gradient_cost) for name, work in self.work.items()}
+
+    def spread(self, column: str = "attitude_rmse_deg") -> dict[str, Spread]:
+        """Statistics of one of `COLUMNS` over the runs, by variant."""
+        return {
+            name: _spread(values, column) for name, values in by_variant(self.rows, column).items()
+        }
+
+    @property
+    def parameters(self) -> dict[str, ParameterSpread]:
+        """Free parameters over the folds by name; the fold's mean where each run has its own."""
+        first, found = self.folds[0].tuned, {}
+        values = [_by_name(fold.tuned.params) for fold in self.folds]
+        start = _by_name(first.start._replace(truth=()))
+        for name in (leaf.name for leaf in first.layout.leaves):
+            if name in start:
+                each = np.stack([value[name] for value in values])
+                deviation = each.std(axis=0, ddof=1)
+                found[name] = ParameterSpread(start[name], each.mean(axis=0), deviation, each)
+        return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """Contents for JSON: rows, statistics over the runs, parameters of each fold in SI units, and work.
+
+        The cost of a gradient is measured by the clock and differs from time to time.
+        """
+        by_column = {column: self.spread(column) for column in COLUMNS}
+        return {
+            "rows": as_dicts(self.rows),
+            "spread": {
+                variant: {column: spread[variant]._asdict() for column, spread in by_column.items()}
+                for variant in dict.fromkeys(row.variant for row in self.rows)
+            },
+            "held_out": [list(fold.held_out) for fold in self.folds],
+            "parameters": {
+                name: {key: np.asarray(value).tolist() for key, value in spread._asdict().items()}
+                for name, spread in self.parameters.items()
+            },
+            "work": {
+                "gradient_cost": None if np.isnan(self.gradient_cost) else self.gradient_cost,
+                "mean": {
+                    name: {**work._asdict(), "forward": self.forward.get(name)}
+                    for name, work in self.work.items()
+                },
+            },
+        }
+
+
+def _spread(values: Sequence[float], column: str) -> Spread:
+    nan = float("nan")
+    if not values:
+        return Spread(nan, nan, nan)
+    array = np.array(values)
+    with np.errstate(divide="ignore"):
+        badness = np.abs(np.log(array)) if column in _BEST_AT_ONE else array
+    deviation = float(array.std(ddof=1)) if len(values) > 1 else nan
+    return Spread(float(array.mean()), deviation, float(array[np.argmax(badness)]))
+
+
+def _by_name(params: Parameters) -> dict[str, Floats]:
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
+    return dict(zip(leaf_names(params), leaves, strict=True))

@@ -1,6 +1,5 @@
 """`jaxekf check`: what runs hold, and whether they can be used as they are."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +21,9 @@ from jaxekf.cli.console import (
     sort_option,
 )
 from jaxekf.io import run_folder
-from jaxekf.io.atomic import check_output, finite_or_null, whole_folder
-from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.atomic import check_output, whole_folder
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.check import CameraCheck, CheckDocument, RunCheck, StreamCheck
 from jaxekf.recordings.types import Recording
 from jaxekf.reporting.plots.style import save
 from jaxekf.reporting.plots.timeaxis import time_axis
@@ -71,22 +71,16 @@ def check(
     checked = [_check(path, sort=sort) for path in runs]
     verdicts = {one.verdict for one in checked}
     worst = next(v for v in ("faults", "warnings", "fine") if v in verdicts)
-    document = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": "jaxekf check",
-        "verdict": worst,
-        "runs": [_document(one) for one in checked],
-    }
+    document = CheckDocument(verdict=worst, runs=[_document(one) for one in checked])
     if output is not None:
         with whole_folder(output, "check.json", overwrite=overwrite) as folder:
-            text = json.dumps(finite_or_null(document), indent=2)
-            (folder / "check.json").write_text(text + "\n", "utf-8")
+            (folder / "check.json").write_text(codec.as_text(document), "utf-8")
             for name, one in _named(checked).items():
                 if one.recording is not None and one.found is not None:
                     save(time_axis(one.recording, one.found), folder / f"check_{name}.png")
         note(f"wrote {output}")
     if as_json:
-        print_json(document)
+        print_json(codec.plain(document))
     for one in checked:
         _tell(one, tables=not as_json)
     if worst != "fine":
@@ -114,31 +108,33 @@ def _named(checked: Sequence[Checked]) -> dict[str, Checked]:
     return found
 
 
-def _document(one: Checked) -> dict[str, Any]:
-    document: dict[str, Any] = {"path": str(one.path), "verdict": one.verdict}
-    found = one.found
+def _document(one: Checked) -> RunCheck:
+    path, verdict, found = str(one.path), one.verdict, one.found
     if found is None:
-        return document | {"faults": [one.error], "warnings": [], "notes": []}
-    streams = {label: told.as_dict() for label, told in found.streams.items()}
+        return RunCheck(path=path, verdict=verdict, faults=[one.error or ""], warnings=[], notes=[])
+    streams = {name: StreamCheck(**stream.as_dict()) for name, stream in found.streams.items()}
     if found.markers:
-        singles = {name: told.as_dict() for name, told in found.markers.items()}
-        streams["markers"]["each"] = singles
+        streams["markers"].each = {
+            name: StreamCheck(**marker.as_dict()) for name, marker in found.markers.items()
+        }
     if found.points is not None:
-        streams["camera"] |= found.points._asdict()
-    if found.camera is not None:
-        streams["camera"] |= found.camera.as_dict()
-        if found.camera.match is not None:
-            streams["camera"]["alignment"] = match_document(found.camera.match)
-    aligned = None if found.alignment is None else run_document(found.alignment)
-    return document | {
-        "run": found.run,
-        "streams": streams,
-        "alignment": aligned,
-        "evidence": found.evidence.as_dict(),
-        "faults": list(found.faults),
-        "warnings": list(found.warnings),
-        "notes": list(found.notes),
-    }
+        camera = found.streams["camera"].as_dict() | found.points._asdict()
+        if found.camera is not None:
+            camera |= found.camera.as_dict()
+            if found.camera.match is not None:
+                camera["alignment"] = match_document(found.camera.match)
+        streams["camera"] = CameraCheck(**camera)
+    return RunCheck(
+        path=path,
+        verdict=verdict,
+        run=found.run,
+        streams=streams,
+        alignment=None if found.alignment is None else run_document(found.alignment),
+        evidence=found.evidence.as_dict(),
+        faults=list(found.faults),
+        warnings=list(found.warnings),
+        notes=list(found.notes),
+    )
 
 
 def _tell(one: Checked, *, tables: bool) -> None:

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxekf.cli.commands import WRITTEN
-from jaxekf.io.atomic import finite_or_null
 from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
 from jaxekf.models.robust import MEANS
 
@@ -65,9 +65,10 @@ def note(text: str) -> None:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """One JSON document on standard output, with its version; numbers that are not finite become null."""
-    told = {"schema_version": SCHEMA_VERSION, **document}
-    click.echo(json.dumps(finite_or_null(told), indent=2))
+    """Print a JSON document with its version; numbers that are not finite become null."""
+    versioned = {"schema_version": SCHEMA_VERSION, **document}
+    # In ASCII, which every terminal can print.
+    click.echo(json.dumps(codec.plain(versioned), indent=2))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

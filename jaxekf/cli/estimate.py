@@ -1,6 +1,6 @@
 """`jaxekf estimate`: attitude, rate and bias of recorded runs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,14 +89,16 @@ def _parts(recording: Recording) -> list[Recording]:
     return good
 
 
-def describe(made: Estimate, recording: Recording, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Summary of one estimate, with what speaks against it and, where there is an encoder, its score."""
+def describe(
+    made: Estimate, recording: Recording, diagnosis: Diagnosis, score: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Summary of one estimate with its diagnosis and, with an encoder, its score."""
     summary = made.summary() | {"diagnosis": diagnosis.as_dict()}
     if "bias" in {part.name for part in manifold.parts(made.model.space)}:
         summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
         summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
-    if recording.encoder is not None:
-        summary["score"] = metrics.score(made, recording).as_dict()
+    if score is not None:
+        summary["score"] = score
         if recording.optical is not None:
             summary["hold_last_deg"] = metrics.score_hold_last(recording, made.time_ns)
     return summary
@@ -203,13 +205,16 @@ def estimate(
         with memory.for_runs([recording.name]):
             made = next(made_of)
             diagnosis = diagnose(made, recording)
+            truth = recording.encoder is not None
+            score = metrics.score(made, recording).as_dict() if truth else None
             folder = made.save(
                 output / recording.name,
                 overwrite=overwrite,
                 exports=exports,
                 diagnosis=diagnosis.as_dict(curves=True),
+                score=score,
             )
-            summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+            summaries.append(describe(made, recording, diagnosis, score) | {"result": str(folder)})
         estimates.append(made)
         warn(made, diagnosis)
         wrote(folder)

@@ -1,6 +1,5 @@
 """A tuning as one plain document, `tuning.json`: what a report needs, without runs, model or filter."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,7 +9,8 @@ import numpy as np
 
 from jaxekf._support.errors import TuningError
 from jaxekf.estimation.parameters import leaf_names
-from jaxekf.io.atomic import finite_or_null, write_whole
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.tuning import TuningDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
 from tuning.comparison.compare import Row, as_dicts
 from tuning.objective.fisher_information import interval
@@ -94,7 +94,7 @@ def record(
         "rows": as_dicts(rows),
         "folds": None if folds is None else folds.as_dict(),
     }
-    found = finite_or_null(_plain(found))
+    found = codec.plain(found)
     return found | {"warnings": cautions(found)}
 
 
@@ -114,22 +114,10 @@ def save_record(
 
 
 def write_record(folder: Path | str, document: Mapping[str, Any]) -> Path:
-    """Write what `record` made as `save_record` does."""
-    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
+    """Write the document of `record` as `save_record` does."""
     file = Path(folder) / FILE
-    write_whole(file, text + "\n")
+    codec.write(file, codec.convert(document, TuningDocument))
     return file
-
-
-def _plain(node: Any) -> Any:
-    """A document without arrays and numbers of NumPy."""
-    if isinstance(node, Mapping):
-        return {str(key): _plain(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [_plain(value) for value in node]
-    if isinstance(node, np.ndarray | np.generic | jax.Array):
-        return np.asarray(node).tolist()
-    return str(node) if isinstance(node, Path) else node
 
 
 def _judged_on(tuned: "Tuned", rows: Sequence[Row], said: JudgedOn | None) -> JudgedOn | None:

@@ -1,13 +1,13 @@
 """Figures of honesty: NIS and whiteness of each sensor's innovations, NEES of what an encoder tells."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxekf._support import chi_square
 from jaxekf.evaluation.consistency import BAND
 from jaxekf.evaluation.metrics import normalised_square
+from jaxekf.io.documents.result import WhitenessTest
 from jaxekf.recordings.types import NANOSECONDS, Floats
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
 from jaxekf.reporting.report._evidence import Evidence
@@ -26,15 +26,15 @@ def innovations(seen: Evidence, bins: int) -> Figure | None:
     result = seen.result
     if not result.sensors:
         return None
-    judged = (result.diagnosis or {}).get("sensors", {})
+    tests = {} if result.diagnosis is None else result.diagnosis.sensors
     curves = {
-        name: white
+        name: curve
         for name in result.sensors
-        if (white := judged.get(name, {}).get("whiteness", {})) and white.get("lag_s")
+        if name in tests and (curve := _curve(tests[name].whiteness)) is not None
     }
     columns = [Column(_TIME, (0.0, float(result.time[-1])), share=1.6 if curves else 1.0)]
     if curves:
-        longest = max(max(white["lag_s"]) for white in curves.values())
+        longest = max(float(curve.lag_s.max()) for curve in curves.values())
         columns.append(Column("lag (s)", (0.0, longest), timed=False))
     grid = Grid(columns, len(result.sensors), row_height=_ROW, bins=bins)
     shade(grid, seen)
@@ -108,9 +108,24 @@ def _positive(squares: Floats) -> Floats:
     return np.where(squares > 0, squares, np.nan)
 
 
-def _autocorrelation(grid: Grid, at: Place, white: Mapping[str, Any]) -> None:
-    lag, rows = np.array(white["lag_s"], float), np.array(white["autocorrelation"], float)
-    bound = np.array(white["bound"], float)
+class _Curve(NamedTuple):
+    """Autocorrelation over lag."""
+
+    lag_s: Floats
+    rows: Floats
+    """(rows, lags)"""
+    bound: Floats
+
+
+def _curve(test: WhitenessTest) -> _Curve | None:
+    """The curve of a saved test; None if there is none."""
+    if test.lag_s is None or test.autocorrelation is None or test.bound is None:
+        return None
+    return _Curve(test.lag_s, test.autocorrelation, test.bound) if test.lag_s.size else None
+
+
+def _autocorrelation(grid: Grid, at: Place, curve: _Curve) -> None:
+    lag, rows, bound = curve
     reach = max(0.1, 1.15 * float(np.abs(rows).max(initial=0.0)), 1.5 * float(bound.max()))
     grid.axis(at, "autocorrelation", (-reach, reach))
     labels = ("x", "y", "z") if len(rows) == 3 else [str(i) for i in range(len(rows))]

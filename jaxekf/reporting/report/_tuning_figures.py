@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf.io.documents.tuning import FreeNumber, RunScore, Step, TuningDocument
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
 from jaxekf.reporting.report._figures import Figure
 from jaxekf.reporting.report._grid import THIRD, axis_style, common_layout
@@ -30,37 +31,37 @@ COLUMNS = (
 """Columns of the tables of runs, their headings and units."""
 
 
-def draw_tuning(document: dict[str, Any]) -> list[Figure]:
+def draw_tuning(document: TuningDocument) -> list[Figure]:
     """All figures that the record of a tuning can show."""
-    again = any(number["left_open"] for number in document["numbers"])
-    found = [search(document["history"], document["best_iteration"], again=again)]
-    if document["rows"]:
-        found.append(compared("compared", "Runs before and after", document["rows"]))
-    if document["folds"] is not None:
-        found.append(compared("folds", "Held-out runs before and after", document["folds"]["rows"]))
-    return [figure for figure in [*found, intervals(document["numbers"])] if figure]
+    again = any(number.left_open for number in document.numbers)
+    found = [search(document.history, document.best_iteration, again=again)]
+    if document.rows:
+        found.append(compared("compared", "Runs before and after", document.rows))
+    if document.folds is not None:
+        found.append(compared("folds", "Held-out runs before and after", document.folds.rows))
+    return [figure for figure in [*found, intervals(document.numbers)] if figure]
 
 
-def known_columns(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+def known_columns(rows: Sequence[RunScore]) -> list[tuple[str, str, str]]:
     """The columns in which any row has a number."""
-    return [c for c in COLUMNS if any(row[c[0]] is not None for row in rows)]
+    return [c for c in COLUMNS if any(getattr(row, c[0]) is not None for row in rows)]
 
 
-def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False) -> Figure | None:
+def search(history: Sequence[Step], best: int, *, again: bool = False) -> Figure | None:
     """The objective of training and validation runs against the iteration; `again` where it went on with
     some numbers back at their start."""
     kinds = [
         kind
         for kind in ("training", "validation")
-        if any(step[kind] is not None and not step["rejected"] for step in history)
+        if any(getattr(step, kind) is not None and not step.rejected for step in history)
     ]
     if not kinds:
         return None
-    numbers = [step["number"] for step in history]
+    numbers = [step.number for step in history]
     data, layout, above = [], _panels(len(kinds)), 0
     for i, (kind, colour) in enumerate(zip(kinds, (ESTIMATE, MEASURED), strict=False)):
         y_axis = _axis_of("y", i)
-        values = [None if step["rejected"] else step[kind] for step in history]
+        values = [None if step.rejected else getattr(step, kind) for step in history]
         style: dict[str, Any] = {"type": "scatter", "xaxis": "x", "yaxis": y_axis}
         line = {"color": colour, "width": 1.4}
         data.append(
@@ -110,22 +111,21 @@ def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False)
             " What the data leave open went back to its start, and the search went on: lower values before"
             " that do not count."
         )
-    if any(step["rejected"] for step in history):
+    if any(step.rejected for step in history):
         caption += " Rejected steps stand at the level of the step before them: they have no value."
     if above:
         caption += f" {above} values lie above the range shown."
     return Figure("search", "The search", caption, {"data": data, "layout": layout})
 
 
-def _refused(history: Sequence[dict[str, Any]], kind: str) -> list[tuple[int, float]]:
+def _refused(history: Sequence[Step], kind: str) -> list[tuple[int, float]]:
     """Where to draw rejected steps: at the last value before them, or the first after."""
-    known = [step[kind] for step in history if step[kind] is not None and not step["rejected"]]
-    level, found = known[0], []
-    for step in history:
-        if step["rejected"]:
-            found.append((step["number"], level))
-        elif step[kind] is not None:
-            level = step[kind]
+    values = [None if step.rejected else getattr(step, kind) for step in history]
+    level, found = next(value for value in values if value is not None), []
+    for step, value in zip(history, values, strict=True):
+        if step.rejected:
+            found.append((step.number, level))
+        level = level if value is None else value
     return found
 
 
@@ -142,10 +142,10 @@ def _limits(values: Sequence[float]) -> tuple[list[float], bool, int]:
     return [low - margin, high + margin], False, sum(v > high for v in values)
 
 
-def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | None:
+def compared(name: str, title: str, rows: Sequence[RunScore]) -> Figure | None:
     """A dot for each run and variant, one panel for each column; what holds the tracker is in the table."""
-    columns = known_columns([row for row in rows if row["variant"] != HELD])
-    runs = list(dict.fromkeys(row["run"] for row in rows))
+    columns = known_columns([row for row in rows if row.variant != HELD])
+    runs = list(dict.fromkeys(row.run for row in rows))
     if not columns:
         return None
     wide = min(len(columns), 2)
@@ -153,7 +153,7 @@ def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | 
     data: list[dict[str, Any]] = []
     for i, (column, head, unit) in enumerate(columns):
         place = {"type": "scatter", "xaxis": _axis_of("x", i % wide), "yaxis": _axis_of("y", i)}
-        told = {(row["run"], row["variant"]): row[column] for row in rows}
+        told = {(row.run, row.variant): getattr(row, column) for row in rows}
         traces = _dots(rows, runs, told, unit)
         data += [
             place | {"showlegend": False} | t for t in traces if i == 0 or t["mode"] == "lines"
@@ -190,7 +190,7 @@ def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | 
 
 
 def _dots(
-    rows: Sequence[dict[str, Any]], runs: Sequence[str], told: dict[Any, Any], unit: str
+    rows: Sequence[RunScore], runs: Sequence[str], told: dict[Any, Any], unit: str
 ) -> list[dict[str, Any]]:
     """Dots of each variant, before them lines from before to after."""
     first, last = before_and_after(rows)
@@ -221,7 +221,7 @@ def _dots(
     return found
 
 
-def _drawn(rows: Sequence[dict[str, Any]], first: str, last: str) -> list[str]:
+def _drawn(rows: Sequence[RunScore], first: str, last: str) -> list[str]:
     """Variants, so that the tuned one lies on top."""
     others = [name for name in variants(rows) if name not in (HELD, first, last)]
     return list(dict.fromkeys([*others, first, last]))
@@ -266,19 +266,20 @@ def _honest(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
     return [across | {"type": "rect", "y0": low, "y1": high, **fill}, across | line]
 
 
-def intervals(numbers: Sequence[dict[str, Any]]) -> Figure | None:
+def intervals(numbers: Sequence[FreeNumber]) -> Figure | None:
     """Of each logarithm that has an interval, value and interval by its start; nothing where there are too
     many to read."""
     shown = [
         n
         for n in numbers
-        if n["logarithm"] and n["interval"] and n["start"] and n["tuned"] and min(n["interval"]) > 0
+        if n.logarithm and n.interval and n.start and n.tuned and min(n.interval) > 0
     ]
     if not shown or len(shown) > _MOST_NUMBERS:
         return None
-    value = np.array([n["tuned"] / n["start"] for n in shown])
-    ends = np.array([n["interval"] for n in shown]) / np.array([[n["start"]] for n in shown])
-    names = [_safe(n["name"] + (f" of {n['run']}" if n["run"] else "")) for n in shown]
+    start = np.array([n.start for n in shown])
+    value = np.array([n.tuned for n in shown]) / start
+    ends = np.array([n.interval for n in shown]) / start[:, None]
+    names = [_safe(n.name + (f" of {n.run}" if n.run else "")) for n in shown]
     trace = {
         "type": "scatter",
         "x": value.tolist(),

@@ -20,7 +20,7 @@ from jaxekf.reporting.report import _consistency as consistency
 from jaxekf.reporting.report import _figures as figures
 from jaxekf.reporting.report import _thinning as thinning
 from jaxekf.reporting.report import write_report
-from jaxekf.reporting.report._evidence import gather
+from jaxekf.reporting.report._comparison import compare
 from jaxekf.reporting.report._saved import read_result
 from jaxekf.simulation import demo
 
@@ -161,7 +161,7 @@ def test_the_table_holds_the_scores(estimated, page, read):
     assert first["verdicts"] and "no diagnosis" in second["verdicts"][0]
     for value in (first["attitude_rmse_deg"], first["held_attitude_deg"]):
         assert f"{value:.3f}" in read.text
-    for words in ("What became of every sample", "masked", "noise.optical", "deg/s/√Hz", "jaxlib"):
+    for words in ("Account of samples", "masked", "noise.optical", "deg/s/√Hz", "jaxlib"):
         assert any(words in text for text in read.text), words
 
 
@@ -226,14 +226,14 @@ def test_another_recording_is_not_taken_for_it(estimated, tmp_path):
     cut = replace(imu, time_ns=imu.time_ns[:-1], gyroscope=imu.gyroscope[:-1])
     jaxekf.save(short.replace(imu=cut), tmp_path / "run")
     result.document.provenance["recording"] = str(tmp_path / "run")
-    seen = gather(result)
+    seen = compare(result)
     assert (
         "another recording" in seen.missing
         and "3000 samples of gyroscope, not 3001" in seen.missing
     )
     assert seen.recording is None and seen.score is None
     result.document.provenance["recording"] = str(demo.FOLDER / "free-5")
-    assert "its name is 'free-5'" in gather(result).missing
+    assert "its name is 'free-5'" in compare(result).missing
 
 
 def test_the_same_input_gives_the_same_file(estimated, tmp_path):
@@ -275,7 +275,7 @@ def test_innovations_and_scores_are_kept_to_the_last_bit(estimated, tmp_path):
     that is refused."""
     made, recording = jaxekf.estimate(estimated[0]), jaxekf.load(estimated[0])
     score = jaxekf.score(made, recording)
-    record, saved = made.sensors["optical"], gather(read_result(estimated[1]))
+    record, saved = made.sensors["optical"], compare(read_result(estimated[1]))
     sensor = saved.result.sensors["optical"]
     np.testing.assert_array_equal(sensor.nis, record.nis)
     np.testing.assert_array_equal(sensor.time_ns, record.time_ns)
@@ -284,7 +284,7 @@ def test_innovations_and_scores_are_kept_to_the_last_bit(estimated, tmp_path):
     with np.load(estimated[1] / "innovations.npz") as arrays:
         np.testing.assert_array_equal(arrays["sensors/optical/residual"], record.residual)
         np.testing.assert_array_equal(arrays["sensors/optical/covariance"], record.cov)
-    before = gather(read_result(of_before(shutil.copytree(estimated[1], tmp_path / "result"))))
+    before = compare(read_result(of_before(shutil.copytree(estimated[1], tmp_path / "result"))))
     np.testing.assert_allclose(before.result.sensors["optical"].nis, sensor.nis, rtol=1e-8)
     np.testing.assert_array_equal(before.result.sensors["optical"].refused, sensor.refused)
     assert before.score is not None and before.score != saved.score
@@ -380,7 +380,7 @@ def test_position_velocity_and_states_of_one_s_own(estimated):
         labels=(*made.labels, "scale_x"),
         columns=made.columns | {"scale_x": path[:, 0], "sigma_scale_x": np.full(count, 0.1)},
     )
-    seen = gather(result)._replace(
+    seen = compare(result)._replace(
         recording=Recording(NAME, encoder=encoder),
         sight=None,
         errors={"position": np.full((count, 3), 0.002)},

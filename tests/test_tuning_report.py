@@ -444,7 +444,10 @@ def test_what_stands_in_the_tables(read):
     # The overview takes the numbers of runs that were not learnt from, where there are any.
     assert "loose|2 runs|0.400|0.305|1.000|0.900|2.625|1.125|0.200|0.900|1.500|1.100" in text
     assert "0.500|0.300|1.100|1.000|–|–|0.200|0.900|1.500|1.000" in text
-    assert "|1.000|1.000|2 runs held out by folds|" in text and "|2 validation runs|nothing" in text
+    assert (
+        "|1.000|1.000|2 runs held out by folds|" in text
+        and "|2 validation runs|no warnings" in text
+    )
 
 
 def test_warnings_stand_before_everything_else(shown):

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, Struct
 
 from jaxekf.calibration.alignment import (
     RunAlignment,
@@ -69,7 +69,7 @@ def align(
     document = documents.AlignmentDocument(
         model=chosen.name,
         runs=[run_document(run) for run in found],
-        together=_together(mean),
+        together=documents.MeanAlignment(**_shared(mean, documents.MeanAlignment)),
         calibration=parameters.to_document(chosen, params, {})["calibration"],
         notes=[*mean.sentences(), *sentences],
         provenance=made_of,
@@ -160,35 +160,17 @@ def run_document(run: RunAlignment) -> documents.RunAlignment:
 def match_document(made: AttitudeMatch) -> documents.StreamAlignment:
     """One stream of a run of `align.json`."""
     return documents.StreamAlignment(
-        latency_s=made.latency_s,
-        latency_sigma_s=made.latency_sigma_s,
-        middle_s=made.middle_s,
-        duration_s=made.duration_s,
-        drift=made.drift,
-        drift_sigma=made.drift_sigma,
-        alignment_deg=np.rad2deg(made.alignment),
-        alignment_sigma_deg=_sigma_deg(made.alignment_cov),
+        **_shared(made, documents.StreamAlignment),
         bias_deg_s=np.rad2deg(made.bias),
         scatter_deg=float(np.rad2deg(made.scatter)),
     )
 
 
-def _together(mean: Together) -> documents.MeanAlignment:
-    return documents.MeanAlignment(
-        latency_s=mean.latency_s,
-        latency_sigma_s=mean.latency_sigma_s,
-        latency_chi2=mean.latency_chi2,
-        latency_p=mean.latency_p,
-        alignment_deg=np.rad2deg(mean.alignment),
-        alignment_sigma_deg=_sigma_deg(mean.alignment_cov),
-        alignment_chi2=mean.alignment_chi2,
-        alignment_p=mean.alignment_p,
-        drift=mean.drift,
-        drift_sigma=mean.drift_sigma,
-        start_latency_s=mean.start_latency_s,
-    )
-
-
-def _sigma_deg(cov: Floats) -> Floats:
-    """Standard deviations in degrees."""
-    return np.rad2deg(np.sqrt(np.diagonal(cov)))
+def _shared(made: AttitudeMatch | Together, kind: type[Struct]) -> dict[str, Any]:
+    """The fields of a document that have the same name in both, and the alignment in degrees."""
+    found = {
+        name: value for name, value in made._asdict().items() if name in kind.__struct_fields__
+    }
+    sigma = np.sqrt(np.diagonal(made.alignment_cov))
+    degrees = {"alignment_deg": made.alignment, "alignment_sigma_deg": sigma}
+    return found | {name: np.rad2deg(value) for name, value in degrees.items()}

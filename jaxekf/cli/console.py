@@ -1,4 +1,4 @@
-"""What the commands share: options, tables, progress and JSON."""
+"""Shared parts of the commands: options, tables, progress and JSON."""
 
 import json
 import sys
@@ -42,19 +42,19 @@ noise_option = click.option(
 sort_option = click.option(
     "--sort",
     is_flag=True,
-    help="Put rows that are out of order in order of time, instead of refusing the file.",
+    help="Sort rows that are out of order by time, instead of refusing the file.",
 )
 robust_option = click.option(
     "--robust",
     "means",
     type=click.Choice(MEANS),
-    help="What to do with samples that do not fit: gate refuses them, huber and student let them count"
-    " less, none takes all in full.  [default: as the model has it]",
+    help="Robust weighting of outliers: gate refuses them, huber and student reduce their weight, none"
+    " uses all samples in full.  [default: that of the model]",
 )
 
 
 def wrote(path: Path) -> None:
-    """Say that an output is there, whole; should the command be stopped it is told again."""
+    """Report that an output is complete; a command that is stopped repeats it."""
     click.get_current_context().meta.setdefault(WRITTEN, []).append(path)
     note(f"wrote {path}")
 
@@ -90,7 +90,7 @@ def _cell(value: Any) -> str:
 
 
 class TuningBar:
-    """What a tuner tells its steps; `stage` says before them what they belong to."""
+    """Progress callback of a tuner; `stage` sets the description of its steps."""
 
     def __init__(self, bar: Progress, iterations: int) -> None:
         self.bar, self.iterations, self.prefix = bar, iterations, "tuning"
@@ -98,12 +98,12 @@ class TuningBar:
 
     def __call__(self, step: Any, total: int) -> None:
         held = "" if step.validation != step.validation else f", validation {step.validation:.5g}"
-        told = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
-        text = f"{self.prefix}: {told}"
+        value = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
+        text = f"{self.prefix}: {value}"
         self.bar.update(self.task, completed=step.number + 1, total=total, description=text)
 
     def stage(self, text: str) -> None:
-        """Begin anew with another description, such as ``fold 2/5``."""
+        """Restart the bar with another description, such as ``fold 2/5``."""
         self.prefix = text
         self.bar.reset(self.task, total=self.iterations, description=text)
 

@@ -1,4 +1,4 @@
-"""`jaxekf demo`: the main job on the bundled recordings, from tuning to pictures."""
+"""`jaxekf demo`: tuning, estimates and figures of the bundled recordings."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +27,7 @@ from jaxekf.recordings.types import Recording
 from jaxekf.simulation import demo as runs
 from tuning.comparison.compare import as_dicts, compare_estimates
 
-# What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
+# Values as from data sheets: a gyroscope's best case, a tracker's worst.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
 _ITERATIONS = 20
 
@@ -107,7 +107,7 @@ def demo(output: Path, as_json: bool) -> None:
             "figures": figures,
         }
         (folder / "demo.json").write_text(codec.as_text(document), "utf-8")
-    # Beside the file, not in it: what is written of the same runs is the same.
+    # Not in the file, which is the same for the same runs.
     document["seconds"] = round(time.perf_counter() - began, 1)
     if as_json:
         print_json(document)

@@ -1,4 +1,4 @@
-"""Output that is written whole or not at all."""
+"""Output that is written atomically."""
 
 import os
 import re
@@ -140,7 +140,7 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _named(made: Path, target: Path) -> Iterator[None]:
-    """What the system says of a temporary name is told of the final one, for which it was asked."""
+    """Errors of the system name the final path instead of the temporary one."""
     try:
         yield
     except OSError as error:

@@ -7,7 +7,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
 
-from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.reporting.report._comparison import ComparedResult
 from jaxekf.reporting.report._figures import Figure
 from jaxekf.reporting.report._grid import PALETTE
 from jaxekf.reporting.report._summary import NUMBERS, Summary, shown
@@ -33,7 +33,7 @@ class Section(NamedTuple):
 
     name: str
     """Its heading, unlike that of any other run."""
-    seen: Evidence
+    compared: ComparedResult
     summary: Summary
     figures: Sequence[Figure]
 
@@ -109,7 +109,7 @@ def _overview(sections: Sequence[Section]) -> Table:
 
 def _content(section: Section, number: int) -> dict[str, Any]:
     """Content of `run.html`."""
-    seen, result = section.seen, section.seen.result
+    compared, result = section.compared, section.compared.result
     diagnosis = result.diagnosis
     return {
         "anchor": f"run-{number}",
@@ -120,18 +120,18 @@ def _content(section: Section, number: int) -> dict[str, Any]:
             f" result in {result.folder}."
         ),
         "verdicts": section.summary.verdicts,
-        "missing": seen.missing,
-        "without_truth": seen.recording is not None and seen.recording.encoder is None,
+        "missing": compared.missing,
+        "without_truth": compared.recording is not None and compared.recording.encoder is None,
         "notes": [*result.document.notes, *(() if diagnosis is None else diagnosis.notes)],
         "figures": section.figures,
-        "account": _account(seen),
-        "origin": _origin(seen),
-        "settings": _settings(seen),
+        "account": _account(compared),
+        "origin": _origin(compared),
+        "settings": _settings(compared),
     }
 
 
-def _account(seen: Evidence) -> Table:
-    account = seen.result.document.account
+def _account(compared: ComparedResult) -> Table:
+    account = compared.result.document.account
     order = ("read", "used", "masked", "gated")
     kinds = dict.fromkeys(key for counts in account.values() for key in counts)
     columns = [k for k in order if k in kinds] + [k for k in kinds if k not in order]
@@ -143,9 +143,9 @@ def _account(seen: Evidence) -> Table:
     return Table(heads, rows, range(1, len(heads)))
 
 
-def _settings(seen: Evidence) -> Table:
+def _settings(compared: ComparedResult) -> Table:
     rows = []
-    for setting in seen.result.settings:
+    for setting in compared.result.settings:
         value, unit = in_degrees(setting.value, setting.unit)
         cells = [number_text(value), unit_text(unit), "", ""]
         if unit != setting.unit:
@@ -154,8 +154,8 @@ def _settings(seen: Evidence) -> Table:
     return Table(["parameter", "value", "unit", "in SI", ""], rows)
 
 
-def _origin(seen: Evidence) -> Table:
-    document = seen.result.document
+def _origin(compared: ComparedResult) -> Table:
+    document = compared.result.document
     provenance = document.provenance
     entries = [
         (key, value) for key, value in provenance.items() if key not in ("versions", "inputs")

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from jaxekf.estimation.result import trackers
 from jaxekf.io.documents.result import SquaresTest
-from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.reporting.report._comparison import ComparedResult
 
 _NAN = float("nan")
 
@@ -62,33 +62,33 @@ def shown(value: Any, decimals: int) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
 
 
-def summarise(seen: Evidence) -> Summary:
+def summarise(compared: ComparedResult) -> Summary:
     """Numbers and verdicts of one run."""
-    document, score = seen.result.document, seen.score
+    document, score = compared.result.document, compared.score
     account, mean_nis = document.account, document.mean_nis
     seeing = trackers(account)
     known = [v for v in (mean_nis.get(name) for name in seeing) if v is not None]
     return Summary(
-        model=seen.result.model,
+        model=compared.result.model,
         duration_s=document.duration_s,
-        samples=len(seen.result.time_ns),
+        samples=len(compared.result.time_ns),
         tracker_used=sum(account[name].get("used", 0) for name in seeing),
         tracker_read=sum(account[name].get("read", 0) for name in seeing),
-        held_attitude_deg=seen.held_deg,
+        held_attitude_deg=compared.hold_last_deg,
         attitude_rmse_deg=_NAN if score is None else score.attitude_rmse_deg,
-        gyroscope_rmse_deg_s=seen.raw_rate_deg_s,
+        gyroscope_rmse_deg_s=compared.raw_rate_deg_s,
         rate_rmse_deg_s=_NAN if score is None else score.rate_rmse_deg_s,
         position_rmse_mm=_NAN if score is None else score.position_rmse_mm,
         attitude_nees=_NAN if score is None else score.attitude_nees,
         position_nees=_NAN if score is None else score.position_nees,
         tracker_nis=sum(known) / len(known) if known else _NAN,
-        verdicts=_verdicts(seen),
+        verdicts=_verdicts(compared),
     )
 
 
-def _verdicts(seen: Evidence) -> tuple[str, ...]:
+def _verdicts(compared: ComparedResult) -> tuple[str, ...]:
     """Sentences of the saved diagnosis, as `Diagnosis.sentences` makes them."""
-    found = seen.result.diagnosis
+    found = compared.result.diagnosis
     if found is None:
         return (
             "no diagnosis is saved in this result: estimate the run again by jaxekf estimate, or save it"
@@ -99,7 +99,7 @@ def _verdicts(seen: Evidence) -> tuple[str, ...]:
     tests = [(f"NIS of {name}", sensor.nis) for name, sensor in found.sensors.items()]
     tests += [(f"NEES of {name}", part) for name, part in found.parts.items()]
     numbers = "; ".join(_mean(name, test) for name, test in tests if test.samples)
-    return (f"nothing speaks against it: {numbers}",) if numbers else ("too little to judge",)
+    return (f"no fault found: {numbers}",) if numbers else ("too few samples to judge",)
 
 
 def _mean(name: str, test: SquaresTest) -> str:

@@ -27,7 +27,7 @@ from jaxekf.reporting.report._tuned import (
 )
 from jaxekf.reporting.report._tuning_figures import known_columns
 
-_NO_WARNING = "nothing speaks against it"
+_NO_WARNING = "no warnings"
 _MOST_NAMED = 12
 _JUDGED_ON = {
     "validation runs": "validation runs (held out)",
@@ -46,7 +46,7 @@ class TuningSection(NamedTuple):
 
     @property
     def warnings(self) -> list[str]:
-        """In sentences."""
+        """Warnings in sentences."""
         return self.tuning.document.warnings
 
 
@@ -195,7 +195,7 @@ def _numbers(document: TuningDocument) -> Table:
         ends = number.interval or (None, None)
         turned, unit = in_degrees([number.start, number.tuned, *ends, number.written], number.unit)
         *cells, written = (number_text(value, 5) for value in turned)
-        remarks = ["left open by the data"] if number.left_open else []
+        remarks = ["unobservable"] if number.left_open else []
         remarks += ["of the encoder"] if number.truth else []
         remarks += [f"of {number.run} alone"] if number.run else []
         moved = number.moved.replace("x ", "× ").replace("prior sigma", "σ of the prior")

@@ -8,7 +8,7 @@
     modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "sendChartToCloud"]
   };
 
-  /* An estimate's band of 2 sigma: there and back along its edges. */
+  /* The 2 sigma band of an estimate, as one closed curve. */
   function band(trace) {
     var about = trace.meta.band === "value" ? trace.y : trace.x.map(function () { return 0; });
     var x = [], upper = [], lower = [];
@@ -54,7 +54,7 @@
     });
   }
 
-  /* Where the columns of a figure stand: what is between them holds a title, however wide the page. */
+  /* Domains of the columns of a figure, with a gap for a title between them at any width. */
   function domains(layout, width) {
     var shares = layout.meta.shares, found = {}, begin = 0;
     var gap = 78 / Math.max(width - layout.margin.l - layout.margin.r, 200);
@@ -67,7 +67,7 @@
     return found;
   }
 
-  /* A page of paper is narrower than a screen, and two figures are to stand on it. */
+  /* A printed page is narrower than a screen, and has room for two figures. */
   function resize(plot, width, scale) {
     if (!plot.layout) { return; }
     var full = plot.layout.meta.height, height = Math.max(Math.round(scale * full), Math.min(full, 250));

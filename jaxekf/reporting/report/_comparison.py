@@ -21,7 +21,7 @@ _NAN = float("nan")
 _GAP_PERIODS = 2.5
 
 
-class Evidence(NamedTuple):
+class ComparedResult(NamedTuple):
     """A result and its recording, if that can still be read."""
 
     result: SavedResult
@@ -29,11 +29,11 @@ class Evidence(NamedTuple):
     missing: str
     """Why there is no recording; empty where there is one."""
     sight: Sight | None
-    lost: list[Stretch]
+    gaps: list[Stretch]
     """Begin and end, in seconds, of the stretches without a pose of the tracker."""
     score: Score | None
     """Against the encoder."""
-    held_deg: float
+    hold_last_deg: float
     """Attitude RMSE of holding the last sample of the tracker; NaN if unknown."""
     raw_rate_deg_s: float
     """Rate RMSE of the gyroscope as it is."""
@@ -41,7 +41,7 @@ class Evidence(NamedTuple):
     """As `metrics.scored_errors`."""
 
 
-def gather(result: SavedResult) -> Evidence:
+def compare(result: SavedResult) -> ComparedResult:
     """Read the recording that a result names, and compare the two.
 
     `missing` says why a recording cannot be used: it is gone, broken, or another one than was estimated.
@@ -52,7 +52,7 @@ def gather(result: SavedResult) -> Evidence:
     if recording is not None:
         sight = look(result, recording)
         sight = sight if sight.label else None
-    lost = _unseen(result) if sight is None else sight.lost
+    gaps = _gaps(result) if sight is None else sight.lost
     score, held, raw, errors = None, _NAN, _NAN, {}
     if recording is not None and recording.encoder is not None:
         score = _saved_score(result) or metrics.score(result, recording)
@@ -61,7 +61,7 @@ def gather(result: SavedResult) -> Evidence:
             held = metrics.score_hold_last(recording, result.time_ns)
         if recording.imu is not None and "rate" in result.outputs:
             raw = metrics.score_raw_rate(recording)
-    return Evidence(result, recording, missing, sight, lost, score, held, raw, errors)
+    return ComparedResult(result, recording, missing, sight, gaps, score, held, raw, errors)
 
 
 def _saved_score(result: SavedResult) -> Score | None:
@@ -106,12 +106,12 @@ def _difference(result: SavedResult, recording: Recording) -> str:
     return ""
 
 
-def _unseen(result: SavedResult) -> list[Stretch]:
+def _gaps(result: SavedResult) -> list[Stretch]:
     """Stretches without a sample of any tracker, by the innovations alone."""
-    seen = [result.sensors[name].time_ns for name in trackers(result.sensors)]
-    if not seen:
+    sampled = [result.sensors[name].time_ns for name in trackers(result.sensors)]
+    if not sampled:
         return []
-    times = np.unique(np.concatenate(seen))
+    times = np.unique(np.concatenate(sampled))
     longest = _GAP_PERIODS * period_ns(times) / NANOSECONDS
     t = np.append((times - result.time_ns[0]) / NANOSECONDS, result.time[-1])
     return [(float(a), float(b)) for a, b in pairwise(t) if b - a > longest]

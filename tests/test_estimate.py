@@ -146,6 +146,7 @@ def test_result_is_named_and_complete(tmp_path):
         "estimate.csv",
         "covariance.npz",
         "innovations_optical.csv",
+        "innovations.npz",
         "noise.toml",
         "calibration.toml",
         "result.json",

@@ -22,7 +22,19 @@ from jaxekf._support import chi_square, deprecations, program_cache
 from jaxekf.cli import main
 
 ROOT = Path(__file__).parents[1]
-HEAVY = {"jax", "numpy", "scipy", "matplotlib", "plotly", "h5py", "optax", "rich", "yaml"}
+HEAVY = {
+    "jax",
+    "numpy",
+    "scipy",
+    "matplotlib",
+    "plotly",
+    "h5py",
+    "optax",
+    "rich",
+    "yaml",
+    "msgspec",
+    "jinja2",
+}
 
 
 def run_python(code, *args, **environment):

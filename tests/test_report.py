@@ -20,7 +20,7 @@ from jaxekf.reporting.report import _consistency as consistency
 from jaxekf.reporting.report import _figures as figures
 from jaxekf.reporting.report import _thinning as thinning
 from jaxekf.reporting.report import write_report
-from jaxekf.reporting.report._evidence import gather
+from jaxekf.reporting.report._comparison import compare
 from jaxekf.reporting.report._saved import read_result
 from jaxekf.simulation import demo
 
@@ -161,7 +161,7 @@ def test_the_table_holds_the_scores(estimated, page, read):
     assert first["verdicts"] and "no diagnosis" in second["verdicts"][0]
     for value in (first["attitude_rmse_deg"], first["held_attitude_deg"]):
         assert f"{value:.3f}" in read.text
-    for words in ("What became of every sample", "masked", "noise.optical", "deg/s/√Hz", "jaxlib"):
+    for words in ("Account of samples", "masked", "noise.optical", "deg/s/√Hz", "jaxlib"):
         assert any(words in text for text in read.text), words
 
 
@@ -225,15 +225,15 @@ def test_another_recording_is_not_taken_for_it(estimated, tmp_path):
     imu = short.need_imu()
     cut = replace(imu, time_ns=imu.time_ns[:-1], gyroscope=imu.gyroscope[:-1])
     jaxekf.save(short.replace(imu=cut), tmp_path / "run")
-    result.document["provenance"]["recording"] = str(tmp_path / "run")
-    seen = gather(result)
+    result.document.provenance["recording"] = str(tmp_path / "run")
+    seen = compare(result)
     assert (
         "another recording" in seen.missing
         and "3000 samples of gyroscope, not 3001" in seen.missing
     )
     assert seen.recording is None and seen.score is None
-    result.document["provenance"]["recording"] = str(demo.FOLDER / "free-5")
-    assert "its name is 'free-5'" in gather(result).missing
+    result.document.provenance["recording"] = str(demo.FOLDER / "free-5")
+    assert "its name is 'free-5'" in compare(result).missing
 
 
 def test_the_same_input_gives_the_same_file(estimated, tmp_path):
@@ -260,6 +260,37 @@ def _edit(folder, **changes):
     (folder / "result.json").write_text(json.dumps(document))
 
 
+def of_before(folder):
+    """A result folder as it was before innovations and scores were kept to the last bit."""
+    document = json.loads((folder / "result.json").read_text())
+    for key in ("innovations", "score"):
+        del document[key]
+    (folder / "result.json").write_text(json.dumps(document))
+    (folder / "innovations.npz").unlink()
+    return folder
+
+
+def test_innovations_and_scores_are_kept_to_the_last_bit(estimated, tmp_path):
+    """Would catch NIS or scores computed again from the rounded tables, or a result of an earlier version
+    that is refused."""
+    made, recording = jaxekf.estimate(estimated[0]), jaxekf.load(estimated[0])
+    score = jaxekf.score(made, recording)
+    record, saved = made.sensors["optical"], compare(read_result(estimated[1]))
+    sensor = saved.result.sensors["optical"]
+    np.testing.assert_array_equal(sensor.nis, record.nis)
+    np.testing.assert_array_equal(sensor.time_ns, record.time_ns)
+    np.testing.assert_array_equal(sensor.freedom, (record.used | record.gated).sum(axis=1))
+    assert saved.score is not None and saved.score[:3] == score[:3]
+    with np.load(estimated[1] / "innovations.npz") as arrays:
+        np.testing.assert_array_equal(arrays["sensors/optical/residual"], record.residual)
+        np.testing.assert_array_equal(arrays["sensors/optical/covariance"], record.cov)
+    before = compare(read_result(of_before(shutil.copytree(estimated[1], tmp_path / "result"))))
+    np.testing.assert_allclose(before.result.sensors["optical"].nis, sensor.nis, rtol=1e-8)
+    np.testing.assert_array_equal(before.result.sensors["optical"].refused, sensor.refused)
+    assert before.score is not None and before.score != saved.score
+    assert before.score[:3] == pytest.approx(score[:3], rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -268,15 +299,21 @@ def _edit(folder, **changes):
         (lambda f: (f / "result.json").write_text("{"), "not JSON"),
         (lambda f: (f / "result.json").write_text("[]"), "schema_version None"),
         (lambda f: _edit(f, schema_version=0), "schema_version 0"),
-        (lambda f: _edit(f, account=None), "account = None"),
-        (lambda f: _edit(f, diagnosis={"verdicts": []}), "a diagnosis without notes"),
+        (lambda f: _edit(f, account=None), "result.json:account: got null, expected object"),
+        (lambda f: _edit(f, diagnosis={"verdicts": []}), "diagnosis.notes: got nothing"),
         (lambda f: (f / "estimate.csv").unlink(), "estimate.csv: got no such file"),
         (lambda f: (f / "estimate.csv").write_text("time,a\n0,1\n"), "other times"),
+        (lambda f: (f / "innovations.npz").unlink(), "innovations.npz: got no such"),
+        (lambda f: (f / "innovations.npz").write_text("x"), "cannot be read"),
+        (lambda f: np.savez(f / "innovations.npz"), "got no sensors/optical/time_ns, sensors/opt"),
         (
-            lambda f: (f / "innovations_optical.csv").unlink(),
+            lambda f: (of_before(f) / "innovations_optical.csv").unlink(),
             "innovations_optical.csv: got no such",
         ),
-        (lambda f: (f / "innovations_optical.csv").write_text("time,a\n0,1\n"), "other columns"),
+        (
+            lambda f: (of_before(f) / "innovations_optical.csv").write_text("time,a\n0,1\n"),
+            "other columns",
+        ),
         (lambda f: (f / "covariance.npz").write_text("x"), "cannot be read"),
         (lambda f: (f / "noise.toml").unlink(), "noise.toml: got no such file"),
         (lambda f: (f / "noise.toml").write_text("["), "not TOML"),
@@ -343,7 +380,7 @@ def test_position_velocity_and_states_of_one_s_own(estimated):
         labels=(*made.labels, "scale_x"),
         columns=made.columns | {"scale_x": path[:, 0], "sigma_scale_x": np.full(count, 0.1)},
     )
-    seen = gather(result)._replace(
+    seen = compare(result)._replace(
         recording=Recording(NAME, encoder=encoder),
         sight=None,
         errors={"position": np.full((count, 3), 0.002)},

@@ -18,6 +18,8 @@ import tuning
 from jaxekf._support.errors import RecordingError, TuningError
 from jaxekf.cli import main
 from jaxekf.estimation.parameters import as_arrays
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.tuning import Step, TuningDocument
 from jaxekf.reporting.report import _tuned as saved
 from jaxekf.reporting.report import _tuning_figures as tuning_figures
 from jaxekf.reporting.report import write_report
@@ -193,6 +195,15 @@ def folds():
         "held_out": [["a"], ["b"]],
         "parameters": {"noise.optical": told, "calibration.alignment": alignment},
     }
+
+
+def typed(document=None):
+    """A record as it is read."""
+    return codec.convert(document or plain(), TuningDocument)
+
+
+def steps(history):
+    return codec.convert(history, list[Step])
 
 
 def write(folder, document):
@@ -434,7 +445,10 @@ def test_what_stands_in_the_tables(read):
     # The overview takes the numbers of runs that were not learnt from, where there are any.
     assert "loose|2 runs|0.400|0.305|1.000|0.900|2.625|1.125|0.200|0.900|1.500|1.100" in text
     assert "0.500|0.300|1.100|1.000|–|–|0.200|0.900|1.500|1.000" in text
-    assert "|1.000|1.000|2 runs held out by folds|" in text and "|2 validation runs|nothing" in text
+    assert (
+        "|1.000|1.000|2 runs held out by folds|" in text
+        and "|2 validation runs|no warnings" in text
+    )
 
 
 def test_warnings_stand_before_everything_else(shown):
@@ -467,7 +481,7 @@ def test_figures_are_what_plotly_takes(read):
 def test_the_search_as_it_was():
     """Would catch training and validation exchanged, another best, or a rejected step drawn as a value."""
     history = [*plain()["history"], step(4, None, None, True), step(5, 5000.0, 1.6)]
-    figure = tuning_figures.search(history, 2)
+    figure = tuning_figures.search(steps(history), 2)
     assert figure is not None
     traces = {(t["name"], t["yaxis"]): t for t in figure.document["data"]}
     assert traces["training", "y"]["y"] == [3.0, 2.0, 1.0, 0.9, None, 5000.0]
@@ -478,17 +492,17 @@ def test_the_search_as_it_was():
     assert layout["yaxis"]["type"] == "log" and "type" not in layout["yaxis2"]
     assert layout["xaxis"]["title"]["text"] == "iteration"
     none = [step(0, None, None, True)]
-    assert tuning_figures.search(none, 0) is None
+    assert tuning_figures.search(steps(none), 0) is None
     for value in history:
         value["validation"] = None
-    alone = tuning_figures.search(history, 2)
+    alone = tuning_figures.search(steps(history), 2)
     assert alone is not None and "yaxis2" not in alone.document["layout"]
 
 
 def test_a_step_far_astray_does_not_flatten_the_rest():
     """Would catch a curve in which nothing is seen beside one wild trial of a likelihood."""
     values = [-1.0, -2.0, 900.0, -3.0]
-    figure = tuning_figures.search([step(i, v, None) for i, v in enumerate(values)], 3)
+    figure = tuning_figures.search(steps([step(i, v, None) for i, v in enumerate(values)]), 3)
     assert figure is not None
     low, high = figure.document["layout"]["yaxis"]["range"]
     assert low < -3.0 and -1.0 < high < 10.0
@@ -497,7 +511,9 @@ def test_a_step_far_astray_does_not_flatten_the_rest():
 
 def test_before_and_after_in_their_units():
     """Would catch dots of another run or column, or a name that Plotly takes for markup."""
-    figure = tuning_figures.compared("folds", "Folds", folds()["rows"])
+    figure = tuning_figures.compared(
+        "folds", "Folds", typed(plain() | {"folds": folds()}).folds.rows
+    )
     assert figure is not None
     layout = figure.document["layout"]
     titles = [layout[f"yaxis{i}"]["title"]["text"] for i in ("", 2, 3, 4, 5, 6)]
@@ -507,7 +523,7 @@ def test_before_and_after_in_their_units():
     assert traces["tuned, pooled", "y3"]["y"] == [None, None]
     shown_once = [t["name"] for t in figure.document["data"] if t.get("showlegend")]
     assert sorted(shown_once) == ["start", "tuned", "tuned, pooled"]
-    named = tuning_figures.compared("compared", "", plain()["rows"])
+    named = tuning_figures.compared("compared", "", typed().rows)
     assert named is not None
     assert named.document["layout"]["xaxis"]["ticktext"][0] == 'free &lt;b&gt;&amp;"5"'
     assert "hold last" not in {t.get("name") for t in named.document["data"]}
@@ -515,14 +531,14 @@ def test_before_and_after_in_their_units():
 
 def test_intervals_are_multiples_of_the_start():
     """Would catch an interval about zero, by the tuned value, or of a number that is no logarithm."""
-    figure = tuning_figures.intervals(plain()["numbers"])
+    figure = tuning_figures.intervals(typed().numbers)
     assert figure is not None
     (trace,) = figure.document["data"]
     assert trace["x"] == pytest.approx([2.0])
     assert trace["error_x"]["array"] == pytest.approx([1.0])
     assert trace["error_x"]["arrayminus"] == pytest.approx([0.5])
-    assert tuning_figures.intervals(plain()["numbers"][1:]) is None
-    assert tuning_figures.intervals(plain()["numbers"][:1] * 100) is None
+    assert tuning_figures.intervals(typed().numbers[1:]) is None
+    assert tuning_figures.intervals(typed().numbers[:1] * 100) is None
 
 
 def test_only_a_tuning(tmp_path):
@@ -548,13 +564,19 @@ def without(*keys):
     [
         (lambda d: d.update(schema_version=2), "schema_version 2, expected 1"),
         (without("schema_version"), "schema_version None"),
-        (without("numbers"), "another numbers or none"),
-        (without("numbers", 1, "unit"), "another numbers[1].unit or none"),
-        (without("history", 0, "rejected"), "another history[0].rejected"),
-        (lambda d: d["rows"][2].update(nees="1"), "another rows[2].nees"),
-        (lambda d: d["numbers"][0].update(interval=[1.0]), "another numbers[0].interval"),
-        (lambda d: d.update(folds=folds() | {"parameters": {"a": {"start": 1}}}), "another folds"),
-        (lambda d: d.update(warnings="none"), "another warnings"),
+        (without("numbers"), "tuning.json:numbers: got nothing"),
+        (without("numbers", 1, "unit"), "tuning.json:numbers[1].unit: got nothing"),
+        (without("history", 0, "rejected"), "history[0].rejected: got nothing"),
+        (lambda d: d["rows"][2].update(nees="1"), "rows[2].nees: got str"),
+        (
+            lambda d: d["numbers"][0].update(interval=[1.0]),
+            "numbers[0].interval: got 1, expected array of length 2",
+        ),
+        (
+            lambda d: d.update(folds=folds() | {"parameters": {"a": {"start": 1}}}),
+            "folds.parameters[...].mean: got nothing",
+        ),
+        (lambda d: d.update(warnings="none"), "warnings: got str, expected array"),
         (lambda d: d.update(covariance_scale=float("nan")), "NaN"),
         (lambda d: d.update(covariance_scale=float("inf")), "Infinity"),
     ],

@@ -74,8 +74,8 @@ _ROOMS = {
         "plots.vectors>_vectors"
     ),
     "jaxekf.reporting.report": (
-        "report.consistency>_consistency report.evidence>_evidence report.figures>_figures "
-        "report.grid>_grid report.markup>_markup report.page>_page report.saved>_saved "
+        "report.consistency>_consistency report.evidence>_comparison report.figures>_figures "
+        "report.grid>_grid report.markup>_tables report.page>_page report.saved>_saved "
         "report.summary>_summary report.thinning>_thinning report.tuned>_tuned "
         "report.tuning_figures>_tuning_figures report.tunings>_tunings"
     ),

@@ -1,11 +1,11 @@
 """`jaxekf align`: clock and frame of the tracker against the IMU."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from msgspec import UNSET, Struct
 
 from jaxekf.calibration.alignment import (
     RunAlignment,
@@ -27,8 +27,9 @@ from jaxekf.cli.console import (
 from jaxekf.cli.estimate import load_runs
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import provenance
-from jaxekf.io.atomic import check_output, finite_or_null, whole_folder
-from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.atomic import check_output, whole_folder
+from jaxekf.io.documents import alignment as documents
+from jaxekf.io.documents import codec
 from jaxekf.io.hashes import inputs_of
 from jaxekf.models import get_model
 from jaxekf.recordings.types import Floats
@@ -48,9 +49,10 @@ def align(
 ) -> None:
     """Clock offset and alignment between tracker and IMU, from the angular rates of RUNS.
 
-    Latency: seconds that the tracker's samples are older than stamped, in the middle of the run, beyond
-    what the recording states; drift: how fast it grows. Alignment: how the tracked frame lies in the
-    IMU's. All runs together give calibration.toml for the model; align.json holds everything.
+    Latency: delay of the tracker's samples in seconds, in the middle of the run, in addition to the
+    latency in the recording's description; drift: its growth in ppm. Alignment: tracker-to-IMU rotation
+    (extrinsic rotation). The mean of all runs is written as calibration.toml for the model; align.json
+    holds the numbers of each run.
     """
     check_output(output, "align.json", overwrite=overwrite)
     chosen = get_model(model)
@@ -64,24 +66,21 @@ def align(
     for text in (*mean.sentences(), *sentences):
         note(text)
     made_of = provenance() | {"inputs": inputs_of(recordings)}
-    document = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": "jaxekf alignment",
-        "model": chosen.name,
-        "runs": [run_document(run) for run in found],
-        "together": _together(mean),
-        "calibration": parameters.to_document(chosen, params, {})["calibration"],
-        "notes": [*mean.sentences(), *sentences],
-        "provenance": made_of,
-    }
+    document = documents.AlignmentDocument(
+        model=chosen.name,
+        runs=[run_document(run) for run in found],
+        together=documents.MeanAlignment(**_shared(mean, documents.MeanAlignment)),
+        calibration=parameters.to_document(chosen, params, {})["calibration"],
+        notes=[*mean.sentences(), *sentences],
+        provenance=made_of,
+    )
     with whole_folder(output, "align.json", overwrite=overwrite) as folder:
         origin = {"aligned": [run.run for run in found]} | made_of
         parameters.save_calibration(folder, chosen, params, origin)
-        text = json.dumps(finite_or_null(document), indent=2)
-        (folder / "align.json").write_text(text + "\n", "utf-8")
+        (folder / "align.json").write_text(codec.as_text(document), "utf-8")
     note(f"wrote {output / 'calibration.toml'} for {chosen.name}")
     if as_json:
-        print_json(document | {"output": str(output)})
+        print_json(codec.plain(document) | {"output": str(output)})
         return
     _print(found, mean)
 
@@ -107,7 +106,7 @@ def _print(found: list[RunAlignment], mean: Together) -> None:
 
 
 def alignment_columns() -> list[str]:
-    """Heads of a table of `aligned_row`."""
+    """Headings of the columns of `aligned_row`."""
     return [
         "run",
         "stream",
@@ -120,7 +119,7 @@ def alignment_columns() -> list[str]:
 
 
 def aligned_row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
-    """One stream of a run, in words."""
+    """One stream of a run, a row of the table."""
     size, axis, sigma = _turn(made.alignment, made.alignment_cov)
     return [
         run,
@@ -142,7 +141,7 @@ def _turn(alignment: Floats, cov: Floats) -> tuple[float, str, float]:
 
 
 def _drift(drift: float, sigma: float) -> str:
-    """In parts per million; a dash where the run is too short to tell."""
+    """Drift in parts per million; a dash for a run that is too short."""
     return "–" if drift != drift else _pm(1e6 * drift, 1e6 * sigma)
 
 
@@ -152,41 +151,26 @@ def _pm(value: float, sigma: float) -> str:
     return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
-def run_document(run: RunAlignment) -> dict[str, Any]:
-    """One run for JSON."""
-    document: dict[str, Any] = {"run": run.run, "tracker": match_document(run.tracker)}
-    if run.encoder is not None:
-        document["encoder"] = match_document(run.encoder)
-    return document | {"notes": list(run.notes)}
+def run_document(run: RunAlignment) -> documents.RunAlignment:
+    """One run of `align.json`."""
+    encoder = UNSET if run.encoder is None else match_document(run.encoder)
+    return documents.RunAlignment(run.run, match_document(run.tracker), encoder, run.notes)
 
 
-def match_document(made: AttitudeMatch) -> dict[str, Any]:
-    """One stream of a run for JSON."""
-    return {
-        "latency_s": made.latency_s,
-        "latency_sigma_s": made.latency_sigma_s,
-        "middle_s": made.middle_s,
-        "duration_s": made.duration_s,
-        "drift": made.drift,
-        "drift_sigma": made.drift_sigma,
-        "alignment_deg": np.rad2deg(made.alignment).tolist(),
-        "alignment_sigma_deg": np.rad2deg(np.sqrt(np.diagonal(made.alignment_cov))).tolist(),
-        "bias_deg_s": np.rad2deg(made.bias).tolist(),
-        "scatter_deg": float(np.rad2deg(made.scatter)),
+def match_document(made: AttitudeMatch) -> documents.StreamAlignment:
+    """One stream of a run of `align.json`."""
+    return documents.StreamAlignment(
+        **_shared(made, documents.StreamAlignment),
+        bias_deg_s=np.rad2deg(made.bias),
+        scatter_deg=float(np.rad2deg(made.scatter)),
+    )
+
+
+def _shared(made: AttitudeMatch | Together, kind: type[Struct]) -> dict[str, Any]:
+    """The fields of a document that have the same name in both, and the alignment in degrees."""
+    found = {
+        name: value for name, value in made._asdict().items() if name in kind.__struct_fields__
     }
-
-
-def _together(mean: Together) -> dict[str, Any]:
-    return {
-        "latency_s": mean.latency_s,
-        "latency_sigma_s": mean.latency_sigma_s,
-        "latency_chi2": mean.latency_chi2,
-        "latency_p": mean.latency_p,
-        "alignment_deg": np.rad2deg(mean.alignment).tolist(),
-        "alignment_sigma_deg": np.rad2deg(np.sqrt(np.diagonal(mean.alignment_cov))).tolist(),
-        "alignment_chi2": mean.alignment_chi2,
-        "alignment_p": mean.alignment_p,
-        "drift": mean.drift,
-        "drift_sigma": mean.drift_sigma,
-        "start_latency_s": mean.start_latency_s,
-    }
+    sigma = np.sqrt(np.diagonal(made.alignment_cov))
+    degrees = {"alignment_deg": made.alignment, "alignment_sigma_deg": sigma}
+    return found | {name: np.rad2deg(value) for name, value in degrees.items()}

@@ -1,6 +1,5 @@
-"""`jaxekf check`: what runs hold, and whether they can be used as they are."""
+"""`jaxekf check`: contents of recorded runs, and whether they can be used."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,18 +21,19 @@ from jaxekf.cli.console import (
     sort_option,
 )
 from jaxekf.io import run_folder
-from jaxekf.io.atomic import check_output, finite_or_null, whole_folder
-from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.atomic import check_output, whole_folder
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.check import CameraCheck, CheckDocument, RunCheck, StreamCheck
 from jaxekf.recordings.types import Recording
 from jaxekf.reporting.plots.style import save
 from jaxekf.reporting.plots.timeaxis import time_axis
 
 STATUS = {"fine": 0, "faults": 1, "warnings": 3}
-"""Exit status by verdict; 2 is that of a command that was called wrongly."""
+"""Exit status by verdict; 2 is a usage error."""
 
 
 class Checked(NamedTuple):
-    """A run that was looked at, or the error with which it could not be read."""
+    """A run that was inspected, or the error that prevents reading it."""
 
     path: Path
     recording: Recording | None
@@ -52,7 +52,7 @@ class Checked(NamedTuple):
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="A folder for check.json and a picture of each run's time axis, check_NAME.png.",
+    help="Folder for check.json and a picture of each run's time axis, check_NAME.png.",
 )
 @sort_option
 @overwrite_option
@@ -60,35 +60,29 @@ class Checked(NamedTuple):
 def check(
     runs: tuple[Path, ...], output: Path | None, sort: bool, overwrite: bool, as_json: bool
 ) -> None:
-    """Samples, gaps, masked rows, clocks, frames and units of RUNS, and whether to trust them.
+    """Samples, gaps, masked rows, clocks, frames and units of RUNS, with a verdict on each run.
 
     Gaps are steps of more than 1.5 times the median; lost is the sum of these. Clock and frame are those
-    that jaxekf align finds. Exit status: 0 where all is fine, 1 for faults (a run that cannot be read, or
-    whose streams contradict its description), 3 for warnings only.
+    that jaxekf align finds. Exit status: 0 for fine, 1 for faults (a run that cannot be read, or whose
+    streams contradict its description), 3 for warnings only.
     """
     if output is not None:
         check_output(output, "check.json", overwrite=overwrite)
     checked = [_check(path, sort=sort) for path in runs]
     verdicts = {one.verdict for one in checked}
     worst = next(v for v in ("faults", "warnings", "fine") if v in verdicts)
-    document = {
-        "schema_version": SCHEMA_VERSION,
-        "kind": "jaxekf check",
-        "verdict": worst,
-        "runs": [_document(one) for one in checked],
-    }
+    document = CheckDocument(verdict=worst, runs=[_document(one) for one in checked])
     if output is not None:
         with whole_folder(output, "check.json", overwrite=overwrite) as folder:
-            text = json.dumps(finite_or_null(document), indent=2)
-            (folder / "check.json").write_text(text + "\n", "utf-8")
+            (folder / "check.json").write_text(codec.as_text(document), "utf-8")
             for name, one in _named(checked).items():
                 if one.recording is not None and one.found is not None:
                     save(time_axis(one.recording, one.found), folder / f"check_{name}.png")
         note(f"wrote {output}")
     if as_json:
-        print_json(document)
+        print_json(codec.plain(document))
     for one in checked:
-        _tell(one, tables=not as_json)
+        _print_run(one, tables=not as_json)
     if worst != "fine":
         click.get_current_context().exit(STATUS[worst])
 
@@ -102,7 +96,7 @@ def _check(path: Path, *, sort: bool) -> Checked:
 
 
 def _named(checked: Sequence[Checked]) -> dict[str, Checked]:
-    """By a name of its own: a second run of a name is numbered."""
+    """Runs by unique names: a second run of a name is numbered."""
     found: dict[str, Checked] = {}
     for one in checked:
         name = one.path.stem if one.found is None else one.found.run
@@ -114,35 +108,37 @@ def _named(checked: Sequence[Checked]) -> dict[str, Checked]:
     return found
 
 
-def _document(one: Checked) -> dict[str, Any]:
-    document: dict[str, Any] = {"path": str(one.path), "verdict": one.verdict}
-    found = one.found
+def _document(one: Checked) -> RunCheck:
+    path, verdict, found = str(one.path), one.verdict, one.found
     if found is None:
-        return document | {"faults": [one.error], "warnings": [], "notes": []}
-    streams = {label: told.as_dict() for label, told in found.streams.items()}
+        return RunCheck(path=path, verdict=verdict, faults=[one.error or ""], warnings=[], notes=[])
+    streams = {name: StreamCheck(**stream.as_dict()) for name, stream in found.streams.items()}
     if found.markers:
-        singles = {name: told.as_dict() for name, told in found.markers.items()}
-        streams["markers"]["each"] = singles
+        streams["markers"].each = {
+            name: StreamCheck(**marker.as_dict()) for name, marker in found.markers.items()
+        }
     if found.points is not None:
-        streams["camera"] |= found.points._asdict()
-    if found.camera is not None:
-        streams["camera"] |= found.camera.as_dict()
-        if found.camera.match is not None:
-            streams["camera"]["alignment"] = match_document(found.camera.match)
-    aligned = None if found.alignment is None else run_document(found.alignment)
-    return document | {
-        "run": found.run,
-        "streams": streams,
-        "alignment": aligned,
-        "evidence": found.evidence.as_dict(),
-        "faults": list(found.faults),
-        "warnings": list(found.warnings),
-        "notes": list(found.notes),
-    }
+        camera = found.streams["camera"].as_dict() | found.points._asdict()
+        if found.camera is not None:
+            camera |= found.camera.as_dict()
+            if found.camera.match is not None:
+                camera["alignment"] = match_document(found.camera.match)
+        streams["camera"] = CameraCheck(**camera)
+    return RunCheck(
+        path=path,
+        verdict=verdict,
+        run=found.run,
+        streams=streams,
+        alignment=None if found.alignment is None else run_document(found.alignment),
+        evidence=found.evidence.as_dict(),
+        faults=list(found.faults),
+        warnings=list(found.warnings),
+        notes=list(found.notes),
+    )
 
 
-def _tell(one: Checked, *, tables: bool) -> None:
-    """A run's tables on standard output, and its faults on standard error, too."""
+def _print_run(one: Checked, *, tables: bool) -> None:
+    """Print the tables of a run on standard output, and its faults on standard error."""
     found = one.found
     if found is None:
         note(f"Error: {one.error}")
@@ -152,10 +148,10 @@ def _tell(one: Checked, *, tables: bool) -> None:
     if not tables:
         return
     streams = dict(found.streams)
-    streams |= {f"  {name}": told for name, told in found.markers.items()}
+    streams |= {f"  {name}": stream for name, stream in found.markers.items()}
     columns = ["stream", "samples", "usable", "rate\n(Hz)", "from\n(s)", "lasts\n(s)"]
     columns += ["gaps", "longest\n(s)", "lost\n(s)", "hidden\n(s)", "dropped"]
-    print_table(found.run, columns, [_row(label, told) for label, told in streams.items()])
+    print_table(found.run, columns, [_row(label, stream) for label, stream in streams.items()])
     if rows := _aligned(found):
         columns = alignment_columns()[1:]
         print_table("Against the IMU, with standard deviations", columns, [r[1:] for r in rows])
@@ -168,24 +164,24 @@ def _tell(one: Checked, *, tables: bool) -> None:
     click.echo(f"{found.run}: {words[found.verdict]}\n")
 
 
-def _row(label: str, told: StreamFound) -> list[Any]:
+def _row(label: str, stream: StreamFound) -> list[Any]:
     return [
         label,
-        told.samples,
-        told.usable,
-        told.rate_hz,
-        f"{told.begin_s:.3f}",
-        told.end_s - told.begin_s,
-        told.gaps.count,
-        told.gaps.longest_s,
-        told.gaps.lost_s,
-        told.hidden.lost_s,
-        sum(told.dropped.values()),
+        stream.samples,
+        stream.usable,
+        stream.rate_hz,
+        f"{stream.begin_s:.3f}",
+        stream.end_s - stream.begin_s,
+        stream.gaps.count,
+        stream.gaps.longest_s,
+        stream.gaps.lost_s,
+        stream.hidden.lost_s,
+        sum(stream.dropped.values()),
     ]
 
 
 def _aligned(found: Inspection) -> list[list[Any]]:
-    """What lies in time and frame against the IMU."""
+    """Rows of clock and frame against the IMU."""
     rows, made = [], found.alignment
     if made is not None:
         rows.append(aligned_row(found.run, "tracker", made.tracker))
@@ -197,7 +193,7 @@ def _aligned(found: Inspection) -> list[list[Any]]:
 
 
 def _points(found: Inspection) -> list[str]:
-    """How much a camera saw, and whether it fits."""
+    """Lines on the landmarks of a camera and its agreement with the IMU."""
     made, seen = found.points, found.camera
     if made is None:
         return []
@@ -207,15 +203,15 @@ def _points(found: Inspection) -> list[str]:
     ]
     if seen is None or seen.posed == 0:
         return lines
-    told = f"camera: {seen.posed} of {seen.images} images looked at fit a pose, points"
-    lines.append(f"{told} {seen.error_px:.2f} pixels about it")
+    posed = f"camera: {seen.posed} of {seen.images} images looked at fit a pose, points"
+    lines.append(f"{posed} {seen.error_px:.2f} pixels about it")
     for text in _evidence(replace(seen.imu, static_norm=np.nan), "camera"):
         lines.append(text if text.startswith("camera") else f"camera, {text}")
     return lines
 
 
 def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
-    """What speaks for units and order; of a camera its poses have no order that could be another."""
+    """Lines on units and order of tracker and IMU; a camera's poses have a known order."""
     lines = []
     if found.rate_ratio == found.rate_ratio:
         lines.append(

@@ -1,4 +1,4 @@
-"""What the commands share: options, tables, progress and JSON."""
+"""Shared parts of the commands: options, tables, progress and JSON."""
 
 import json
 import sys
@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxekf.cli.commands import WRITTEN
-from jaxekf.io.atomic import finite_or_null
 from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
 from jaxekf.models.robust import MEANS
 
@@ -42,19 +42,19 @@ noise_option = click.option(
 sort_option = click.option(
     "--sort",
     is_flag=True,
-    help="Put rows that are out of order in order of time, instead of refusing the file.",
+    help="Sort rows that are out of order by time, instead of refusing the file.",
 )
 robust_option = click.option(
     "--robust",
     "means",
     type=click.Choice(MEANS),
-    help="What to do with samples that do not fit: gate refuses them, huber and student let them count"
-    " less, none takes all in full.  [default: as the model has it]",
+    help="Robust weighting of outliers: gate refuses them, huber and student reduce their weight, none"
+    " uses all samples in full.  [default: that of the model]",
 )
 
 
 def wrote(path: Path) -> None:
-    """Say that an output is there, whole; should the command be stopped it is told again."""
+    """Report that an output is complete; a command that is stopped repeats it."""
     click.get_current_context().meta.setdefault(WRITTEN, []).append(path)
     note(f"wrote {path}")
 
@@ -65,9 +65,10 @@ def note(text: str) -> None:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """One JSON document on standard output, with its version; numbers that are not finite become null."""
-    told = {"schema_version": SCHEMA_VERSION, **document}
-    click.echo(json.dumps(finite_or_null(told), indent=2))
+    """Print a JSON document with its version; numbers that are not finite become null."""
+    versioned = {"schema_version": SCHEMA_VERSION, **document}
+    # In ASCII, which every terminal can print.
+    click.echo(json.dumps(codec.plain(versioned), indent=2))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -89,7 +90,7 @@ def _cell(value: Any) -> str:
 
 
 class TuningBar:
-    """What a tuner tells its steps; `stage` says before them what they belong to."""
+    """Progress callback of a tuner; `stage` sets the description of its steps."""
 
     def __init__(self, bar: Progress, iterations: int) -> None:
         self.bar, self.iterations, self.prefix = bar, iterations, "tuning"
@@ -97,12 +98,12 @@ class TuningBar:
 
     def __call__(self, step: Any, total: int) -> None:
         held = "" if step.validation != step.validation else f", validation {step.validation:.5g}"
-        told = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
-        text = f"{self.prefix}: {told}"
+        value = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
+        text = f"{self.prefix}: {value}"
         self.bar.update(self.task, completed=step.number + 1, total=total, description=text)
 
     def stage(self, text: str) -> None:
-        """Begin anew with another description, such as ``fold 2/5``."""
+        """Restart the bar with another description, such as ``fold 2/5``."""
         self.prefix = text
         self.bar.reset(self.task, total=self.iterations, description=text)
 

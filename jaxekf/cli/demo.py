@@ -1,6 +1,5 @@
-"""`jaxekf demo`: the main job on the bundled recordings, from tuning to pictures."""
+"""`jaxekf demo`: tuning, estimates and figures of the bundled recordings."""
 
-import json
 import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
@@ -16,9 +15,11 @@ from jaxekf.estimation.batch import estimate_many, provenance
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.estimation.result import Estimate
 from jaxekf.evaluation.diagnosis import diagnose
+from jaxekf.evaluation.metrics import score
 from jaxekf.filtering.model import Parameters
 from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.description import SCHEMA_VERSION
+from jaxekf.io.documents import codec
 from jaxekf.io.hashes import inputs_of
 from jaxekf.io.run_folder import load
 from jaxekf.models import get_model
@@ -27,7 +28,7 @@ from jaxekf.simulation import demo as runs
 from tuning.comparison.compare import compare_estimates
 from tuning.results.comparison import as_dicts
 
-# What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
+# Values as from data sheets: a gyroscope's best case, a tracker's worst.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
 _ITERATIONS = 20
 
@@ -87,7 +88,8 @@ def demo(output: Path, as_json: bool) -> None:
         tuning.save(tuned, folder, rows=compared.rows)
         for made, recording in zip(compared.estimates["tuned"], compared.recordings, strict=True):
             found = diagnose(made, recording).as_dict(curves=True)
-            made.save(folder / "result" / recording.name, diagnosis=found)
+            judged = score(made, recording).as_dict()
+            made.save(folder / "result" / recording.name, diagnosis=found, score=judged)
             chosen = ("attitude", "occlusion")
             if recording.name == "constant-rate":
                 chosen = possible_figures(made, recording)
@@ -105,8 +107,8 @@ def demo(output: Path, as_json: bool) -> None:
             },
             "figures": figures,
         }
-        (folder / "demo.json").write_text(json.dumps(document, indent=2) + "\n", "utf-8")
-    # Beside the file, not in it: what is written of the same runs is the same.
+        (folder / "demo.json").write_text(codec.as_text(document), "utf-8")
+    # Not in the file, which is the same for the same runs.
     document["seconds"] = round(time.perf_counter() - began, 1)
     if as_json:
         print_json(document)

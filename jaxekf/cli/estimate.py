@@ -1,6 +1,6 @@
 """`jaxekf estimate`: attitude, rate and bias of recorded runs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,25 +89,27 @@ def _parts(recording: Recording) -> list[Recording]:
     return good
 
 
-def describe(made: Estimate, recording: Recording, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Summary of one estimate, with what speaks against it and, where there is an encoder, its score."""
+def describe(
+    made: Estimate, recording: Recording, diagnosis: Diagnosis, score: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Summary of one estimate with its diagnosis and, with an encoder, its score."""
     summary = made.summary() | {"diagnosis": diagnosis.as_dict()}
     if "bias" in {part.name for part in manifold.parts(made.model.space)}:
         summary["bias_deg_s"] = np.rad2deg(made.bias.value[-1]).tolist()
         summary["bias_sigma_deg_s"] = np.rad2deg(made.bias.sigma[-1]).tolist()
-    if recording.encoder is not None:
-        summary["score"] = metrics.score(made, recording).as_dict()
+    if score is not None:
+        summary["score"] = score
         if recording.optical is not None:
             summary["hold_last_deg"] = metrics.score_hold_last(recording, made.time_ns)
     return summary
 
 
 def warn(made: Estimate, diagnosis: Diagnosis) -> None:
-    """Say what a table would hide: rows that fell outside the run, and whether it can be believed."""
+    """Print notes that are not in the table: dropped rows and the diagnosis."""
     for name, count in made.account.items():
         if count.get("dropped_outside_run"):
             note(
-                f"{made.run}: {count['dropped_outside_run']} of {count['read']} samples of {name} lie"
+                f"{made.run}: {count['dropped_outside_run']} of {count['read']} samples of {name} are"
                 " outside the run and were dropped"
             )
     for text in (*made.notes, *diagnosis.sentences(), *diagnosis.notes):
@@ -126,28 +128,28 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 @click.option(
     "--online",
     is_flag=True,
-    help="At each sample of the IMU only with what had arrived by then, as a live system with the"
-    " tracker's latency would have said; for models that an IMU drives.",
+    help="Causal estimate at each sample of the IMU from the measurements that had arrived by then, with"
+    " the tracker's latency as in a live system; for models that an IMU drives.",
 )
 @click.option(
     "--smooth",
     is_flag=True,
-    help="Each instant from the whole run, not only from what was measured until then.",
+    help="Run the smoother: each instant uses the measurements of the whole run.",
 )
 @click.option(
     "--export",
     "exports",
     multiple=True,
     type=click.Choice(tuple(FILES)),
-    help="A further file in each result folder: everything as estimate.npz or estimate.h5, the path as"
-    " trajectory.tum; repeatable.",
+    help="Further file in each result folder: the whole estimate as estimate.npz or estimate.h5, the"
+    " trajectory as trajectory.tum; repeatable.",
 )
 @click.option(
     "--at",
     "times_files",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Estimate also at the times of this CSV file's column time, seconds on the recording's clock:"
+    help="CSV file of further output times, in its column time, in seconds on the recording's clock:"
     " writes requested.csv, and exports hold these times only. One for all runs, or repeated for each.",
 )
 @click.option(
@@ -155,7 +157,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     "distance",
     type=click.FloatRange(min=1e-9, max=1e9),
     metavar="SECONDS",
-    help="As --at, on a regular grid from the first instant of each run on.",
+    help="Further output times as with --at, on a regular grid from the first instant of each run.",
 )
 @overwrite_option
 @json_option
@@ -177,14 +179,14 @@ def estimate(
     """Estimate RUNS and write a result folder for each under the output."""
     if online and smooth:
         raise click.UsageError(
-            "got --online and --smooth, expected one of them: what was known at a time does not know the"
-            " whole run; leave one out"
+            "got --online and --smooth, expected one of them: a causal estimate does not use the whole"
+            " run; leave one out"
         )
     requested = _requested(times_files, distance, len(runs))
     if online and requested is not None:
         raise click.UsageError(
-            "got --online and times to estimate at, expected one of them: what was known is told at the"
-            " samples of the IMU; leave one out, or feed a jaxekf.Stream"
+            "got --online and times to estimate at, expected one of them: a causal estimate is made at"
+            " the samples of the IMU; leave one out, or feed a jaxekf.Stream"
         )
     chosen = get_model(model) if means is None else robust(model, means)
     params = parameters.load(chosen, *noise_files)
@@ -203,13 +205,16 @@ def estimate(
         with memory.for_runs([recording.name]):
             made = next(made_of)
             diagnosis = diagnose(made, recording)
+            truth = recording.encoder is not None
+            score = metrics.score(made, recording).as_dict() if truth else None
             folder = made.save(
                 output / recording.name,
                 overwrite=overwrite,
                 exports=exports,
                 diagnosis=diagnosis.as_dict(curves=True),
+                score=score,
             )
-            summaries.append(describe(made, recording, diagnosis) | {"result": str(folder)})
+            summaries.append(describe(made, recording, diagnosis, score) | {"result": str(folder)})
         estimates.append(made)
         warn(made, diagnosis)
         wrote(folder)
@@ -229,7 +234,7 @@ def estimate(
 def _requested(
     files: tuple[Path, ...], distance: float | None, runs: int
 ) -> list[Requested] | Every | None:
-    """The instants that were asked for by one of two options, for each run or all."""
+    """Output times requested by one of two options, for each run or all."""
     if files and distance is not None:
         raise click.UsageError(
             "got --at and --every, expected one of them, since each says which times; leave one out"
@@ -249,7 +254,7 @@ def _requested(
 
 
 def _inside(asked: Requested | Every | None, recording: Recording) -> Any:
-    """Of what was asked for of a run, what lies in one of its parts; None for nothing."""
+    """Requested times of a run that are in one of its parts; None for none."""
     if "part" not in recording.info or not isinstance(asked, np.ndarray):
         return asked
     time = recording.need_imu().time_ns
@@ -258,7 +263,7 @@ def _inside(asked: Requested | Every | None, recording: Recording) -> Any:
 
 
 def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
-    """One row a run; columns of position only where some run's can be judged."""
+    """Print one row for each run, with columns of position if any run has a score of it."""
     columns = ["run", "seconds"]
     scores = {
         "attitude_rmse_deg": "attitude RMSE\n(deg)",

@@ -22,9 +22,9 @@ from jaxekf.reporting.report import write_report
 def report(results: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
     """Show RESULTS, folders written by jaxekf estimate or jaxekf tune, in one HTML file without network.
 
-    Of estimates: their bands beside tracker, gyroscope and encoder, biases, innovations, what became of
-    every sample, and the verdicts; recordings are looked for where they were when they were estimated. Of
-    tunings: what speaks against them, the search, runs before and after, parameters and folds.
+    Estimates are shown with their bands, tracker, gyroscope and encoder, biases, innovations, account of
+    samples and verdicts; a recording is read from the path at which it was estimated. Tunings are shown
+    with warnings, search, runs before and after, parameters and folds.
     """
     made = write_report(results, output, overwrite=overwrite)
     for name, missing in zip(made.runs, made.missing, strict=True):

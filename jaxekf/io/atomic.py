@@ -1,10 +1,9 @@
 """Output that is written atomically."""
 
-import math
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -141,7 +140,7 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _named(made: Path, target: Path) -> Iterator[None]:
-    """Errors of the system about a temporary name are raised with the final name, which the user gave."""
+    """Errors of the system name the final path instead of the temporary one."""
     try:
         yield
     except OSError as error:
@@ -175,17 +174,6 @@ def check_file(path: Path | str, marker: str, *, overwrite: bool = False) -> Non
         raise RecordingError(
             target, "a file that exists", "a new one", "another output or the overwrite option"
         )
-
-
-def finite_or_null(node: Any) -> Any:
-    """A JSON document in which numbers that are not finite, of which JSON knows none, are null."""
-    if isinstance(node, Mapping):
-        return {key: finite_or_null(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [finite_or_null(value) for value in node]
-    if isinstance(node, float) and not math.isfinite(node):
-        return None
-    return node
 
 
 def write_whole(path: Path | str, text: str) -> None:

@@ -58,7 +58,7 @@ def check_exports(folder):
 def check_result(folder):
     """A result folder: all its files are of one writing."""
     read = read_result(folder)
-    number = read.document["log_likelihood"]
+    number = read.document.log_likelihood
     assert len(read.time_ns) == COUNT
     assert (read.columns["bias_x"] == number).all()
     assert (read.cov[:, 0, 0] == number + 1.0).all()

@@ -50,7 +50,10 @@ def test_text_files_of_another_version(result, tmp_path, version):
 
 
 @pytest.mark.parametrize("version", [None, 0, 2])
-@pytest.mark.parametrize("name", ["estimate.npz", "estimate.h5", "covariance.npz", "noise.toml"])
+@pytest.mark.parametrize(
+    "name",
+    ["estimate.npz", "estimate.h5", "covariance.npz", "innovations.npz", "noise.toml"],
+)
 def test_parts_of_a_result_of_another_version(result, tmp_path, name, version):
     """Would catch an export, or one file of a result folder, of another version taken for this one's."""
     folder = tmp_path / "result"

@@ -1,6 +1,5 @@
 """The document `tuning.json`: all that a report of a tuning needs."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +9,8 @@ import numpy as np
 
 from jaxekf._support.errors import TuningError
 from jaxekf.estimation.parameters import leaf_names
-from jaxekf.io.atomic import finite_or_null, write_whole
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.tuning import TuningDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
 from tuning.objective.fisher_information import interval
 from tuning.parametrisation.free_vector import SCALED, Leaf
@@ -91,7 +91,7 @@ def record(
         "rows": as_dicts(rows),
         "folds": None if folds is None else folds.as_dict(),
     }
-    found = finite_or_null(_plain(found))
+    found = codec.plain(found)
     return found | {"warnings": cautions(found)}
 
 
@@ -134,22 +134,10 @@ def save_record(
 
 
 def write_record(folder: Path | str, document: Mapping[str, Any]) -> Path:
-    """Write a document of `record` as `save_record` does."""
-    text = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
+    """Write the document of `record` as `save_record` does."""
     file = Path(folder) / FILE
-    write_whole(file, text + "\n")
+    codec.write(file, codec.convert(document, TuningDocument))
     return file
-
-
-def _plain(node: Any) -> Any:
-    """Replace arrays and numbers of NumPy by plain ones."""
-    if isinstance(node, Mapping):
-        return {str(key): _plain(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [_plain(value) for value in node]
-    if isinstance(node, np.ndarray | np.generic | jax.Array):
-        return np.asarray(node).tolist()
-    return str(node) if isinstance(node, Path) else node
 
 
 def _judged_on(tuned: Tuned, rows: Sequence[Row], given: JudgedOn | None) -> JudgedOn | None:

@@ -1,7 +1,7 @@
-"""A page that shows results beside what was measured and what is true: one HTML file, no network.
+"""The report: results with measurements and truth in one HTML file, which needs no network.
 
-It is made of result folders and tuned folders alone, and of the results' recordings where those still are
-where they were: no model and no filter is run.
+Its input are result folders, tuned folders and the recordings that the results name: no model or filter is
+run. `write_report` is public. Text and HTML are in `templates`; a new figure goes into `_figures`.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from typing import NamedTuple
 from jaxekf.io.atomic import check_file, write_whole
 from jaxekf.reporting.report import _consistency as consistency
 from jaxekf.reporting.report import _figures as figures
-from jaxekf.reporting.report._evidence import gather
+from jaxekf.reporting.report._comparison import compare
 from jaxekf.reporting.report._page import MARKER, Section, compose
 from jaxekf.reporting.report._saved import SavedResult, read_result
 from jaxekf.reporting.report._summary import Summary, summarise
@@ -25,7 +25,7 @@ _BINS_IN_ALL, _MOST_BINS, _FEWEST_BINS = 1500, 500, 120
 
 
 class Written(NamedTuple):
-    """What a report was made of, run by run, and how large it is."""
+    """Content and size of a report that was written."""
 
     path: Path
     size: int
@@ -33,37 +33,39 @@ class Written(NamedTuple):
     runs: tuple[str, ...]
     """Headings, in order."""
     folders: tuple[Path, ...]
-    """Of the runs, in the same order."""
+    """Result folders in the same order."""
     summaries: tuple[Summary, ...]
     missing: tuple[str, ...]
-    """Why a run's recording could not be read; empty where it was."""
+    """For each run the reason why its recording could not be read; empty if it was."""
     tunings: tuple[TuningSection, ...]
 
 
 def write_report(
     folders: Sequence[Path | str], output: Path | str, *, overwrite: bool = False
 ) -> Written:
-    """Write one report of several result folders and tuned folders, whole or not at all.
+    """Write one report of several result folders and tuned folders, atomically.
 
-    They may come in any order; one that is named twice is shown once. Raises `RecordingError` for a folder
-    that holds no readable result or tuning of this version, and where `output` may not be written. The more
-    runs, the more coarsely long series are drawn, to keep the file small.
+    They may come in any order; one that is named twice is shown once. Long series are drawn more coarsely
+    for many runs, to keep the file small. Raises `RecordingError` for a folder without a readable result or
+    tuning of this version, and for an `output` that may not be written.
     """
     check_file(output, MARKER, overwrite=overwrite)
-    read = [_read(folder) for folder in _once(folders)]
+    read = [_read(folder) for folder in _without_repeats(folders)]
     results = [found for found in read if isinstance(found, SavedResult)]
     tunings = [found for found in read if isinstance(found, SavedTuning)]
     bins = max(_FEWEST_BINS, min(_MOST_BINS, _BINS_IN_ALL // max(1, len(results))))
     sections = []
-    names = _unlike([(result.run, result.folder) for result in results])
+    names = _unique_names([(result.run, result.folder) for result in results])
     for name, result in zip(names, results, strict=True):
-        seen = gather(result)
-        drawn = figures.draw(seen, bins)
+        compared = compare(result)
+        drawn = figures.draw(compared, bins)
         drawn += [
-            f for f in (consistency.innovations(seen, bins), consistency.errors(seen, bins)) if f
+            f
+            for f in (consistency.innovations(compared, bins), consistency.errors(compared, bins))
+            if f
         ]
-        sections.append(Section(name, seen, summarise(seen), drawn))
-    names = _unlike([(tuning.folder.resolve().name, tuning.folder) for tuning in tunings])
+        sections.append(Section(name, compared, summarise(compared), drawn))
+    names = _unique_names([(tuning.folder.resolve().name, tuning.folder) for tuning in tunings])
     tuned = [
         TuningSection(name, tuning, draw_tuning(tuning.document))
         for name, tuning in zip(names, tunings, strict=True)
@@ -76,13 +78,13 @@ def write_report(
         tuple(section.name for section in sections),
         tuple(result.folder for result in results),
         tuple(section.summary for section in sections),
-        tuple(section.seen.missing for section in sections),
+        tuple(section.compared.missing for section in sections),
         tuple(tuned),
     )
 
 
-def _once(folders: Sequence[Path | str]) -> list[Path]:
-    """The folders without those that were named before, under whatever name."""
+def _without_repeats(folders: Sequence[Path | str]) -> list[Path]:
+    """The folders, each once, whatever path names it."""
     found: dict[Path, Path] = {}
     for folder in map(Path, folders):
         found.setdefault(folder.resolve(), folder)
@@ -95,7 +97,7 @@ def _read(folder: Path) -> SavedResult | SavedTuning:
     return read_result(folder)
 
 
-def _unlike(named: Sequence[tuple[str, Path]]) -> list[str]:
-    """Headings: the names, with their folders where several are alike."""
+def _unique_names(named: Sequence[tuple[str, Path]]) -> list[str]:
+    """Headings: the names, with their folders if several are equal."""
     names = [name for name, _ in named]
     return [f"{name} ({folder})" if names.count(name) > 1 else name for name, folder in named]

@@ -1,16 +1,16 @@
-"""Figures of honesty: NIS and whiteness of each sensor's innovations, NEES of what an encoder tells."""
+"""Figures of consistency: NIS and whiteness of innovations, NEES against the encoder."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxekf._support import chi_square
 from jaxekf.evaluation.consistency import BAND
 from jaxekf.evaluation.metrics import normalised_square
+from jaxekf.io.documents.result import WhitenessTest
 from jaxekf.recordings.types import NANOSECONDS, Floats
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
-from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.reporting.report._comparison import ComparedResult
 from jaxekf.reporting.report._figures import Figure, shade
 from jaxekf.reporting.report._grid import THIRD, Column, Grid, Place
 
@@ -21,23 +21,23 @@ _PERCENT = f"{100 * BAND:.0f} %"
 _TIME = "time since the start of the estimate (s)"
 
 
-def innovations(seen: Evidence, bins: int) -> Figure | None:
+def innovations(compared: ComparedResult, bins: int) -> Figure | None:
     """A row for each sensor: NIS over time and, where a diagnosis was saved, autocorrelation over lag."""
-    result = seen.result
+    result = compared.result
     if not result.sensors:
         return None
-    judged = (result.diagnosis or {}).get("sensors", {})
+    tests = {} if result.diagnosis is None else result.diagnosis.sensors
     curves = {
-        name: white
+        name: curve
         for name in result.sensors
-        if (white := judged.get(name, {}).get("whiteness", {})) and white.get("lag_s")
+        if name in tests and (curve := _curve(tests[name].whiteness)) is not None
     }
     columns = [Column(_TIME, (0.0, float(result.time[-1])), share=1.6 if curves else 1.0)]
     if curves:
-        longest = max(max(white["lag_s"]) for white in curves.values())
+        longest = max(float(curve.lag_s.max()) for curve in curves.values())
         columns.append(Column("lag (s)", (0.0, longest), timed=False))
     grid = Grid(columns, len(result.sensors), row_height=_ROW, bins=bins)
-    shade(grid, seen)
+    shade(grid, compared)
     for i, (name, sensor) in enumerate(result.sensors.items()):
         t = (sensor.time_ns - result.time_ns[0]) / NANOSECONDS
         _squares(grid, Place(i), f"NIS of {name}", sensor.nis, sensor.freedom)
@@ -51,28 +51,28 @@ def innovations(seen: Evidence, bins: int) -> Figure | None:
             grid.dots(Place(i), t[out], refused, name="NIS, refused by the gate", **style)
         if name in curves:
             _autocorrelation(grid, Place(i, 1), curves[name])
-    grid.key(f"{_PERCENT} of honest ones", ESTIMATE, opacity=0.3)
+    grid.key(f"{_PERCENT} of a consistent filter", ESTIMATE, opacity=0.3)
     caption = (
-        f"Normalised innovation squared: {_PERCENT} lie in the band where the noise is right; the line is"
+        f"Normalised innovation squared: for a consistent filter {_PERCENT} are in the band; the line is"
         " their expected mean."
     )
     if curves:
         caption += (
-            f" Autocorrelation of whitened innovations, row by row: within the dashed bounds in {_PERCENT}"
-            " of all lags where the filter is right."
+            f" Autocorrelation of whitened innovations, row by row: for a consistent filter within the"
+            f" dashed bounds at {_PERCENT} of all lags."
         )
     return Figure("innovations", "Innovations", caption, grid.document())
 
 
-def errors(seen: Evidence, bins: int) -> Figure | None:
-    """NEES of each output of which an encoder tells the truth."""
-    result = seen.result
-    known = {name: e for name, e in seen.errors.items() if np.isfinite(e).all(axis=1).any()}
+def errors(compared: ComparedResult, bins: int) -> Figure | None:
+    """NEES of each output that the encoder measures, too."""
+    result = compared.result
+    known = {name: e for name, e in compared.errors.items() if np.isfinite(e).all(axis=1).any()}
     if not known:
         return None
     columns = [Column(_TIME, (0.0, float(result.time[-1])))]
     grid = Grid(columns, len(known), row_height=_ROW, bins=bins)
-    shade(grid, seen)
+    shade(grid, compared)
     for i, (name, error) in enumerate(known.items()):
         kept = np.isfinite(error).all(axis=1)
         squares = np.full(len(error), np.nan)
@@ -81,11 +81,11 @@ def errors(seen: Evidence, bins: int) -> Figure | None:
         _squares(grid, Place(i), f"NEES of {name}", squares, freedom)
         shown = _positive(squares)
         grid.line(Place(i), result.time, shown, name="NEES", colour=ESTIMATE, unit="", width=0.9)
-    grid.key(f"{_PERCENT} of honest ones", ESTIMATE, opacity=0.3)
+    grid.key(f"{_PERCENT} of a consistent filter", ESTIMATE, opacity=0.3)
     caption = (
-        "Normalised error squared against the encoder, at scored samples: above the band the estimate is"
-        " surer than it should be, below it less sure. Unlike innovations, errors last: many"
-        " neighbouring samples tell as much as one."
+        "Normalised error squared against the encoder, at scored samples: above the band the covariance is"
+        " too small, below it too large. Unlike innovations, errors are correlated over time: many"
+        " neighbouring samples count as one."
     )
     return Figure("errors", "Errors against their covariance", caption, grid.document())
 
@@ -104,13 +104,28 @@ def _squares(grid: Grid, at: Place, title: str, squares: Floats, freedom: Floats
 
 
 def _positive(squares: Floats) -> Floats:
-    """What a logarithmic axis can show."""
+    """Squares for a logarithmic axis: NaN for those that are not positive."""
     return np.where(squares > 0, squares, np.nan)
 
 
-def _autocorrelation(grid: Grid, at: Place, white: Mapping[str, Any]) -> None:
-    lag, rows = np.array(white["lag_s"], float), np.array(white["autocorrelation"], float)
-    bound = np.array(white["bound"], float)
+class _Curve(NamedTuple):
+    """Autocorrelation over lag."""
+
+    lag_s: Floats
+    rows: Floats
+    """(rows, lags)"""
+    bound: Floats
+
+
+def _curve(test: WhitenessTest) -> _Curve | None:
+    """The curve of a saved test; None if there is none."""
+    if test.lag_s is None or test.autocorrelation is None or test.bound is None:
+        return None
+    return _Curve(test.lag_s, test.autocorrelation, test.bound) if test.lag_s.size else None
+
+
+def _autocorrelation(grid: Grid, at: Place, curve: _Curve) -> None:
+    lag, rows, bound = curve
     reach = max(0.1, 1.15 * float(np.abs(rows).max(initial=0.0)), 1.5 * float(bound.max()))
     grid.axis(at, "autocorrelation", (-reach, reach))
     labels = ("x", "y", "z") if len(rows) == 3 else [str(i) for i in range(len(rows))]

@@ -1,4 +1,4 @@
-"""Which figures a result can show, and what stands in them: the choices of `jaxekf plot`, to zoom into."""
+"""The figures of a result: quantities of `jaxekf plot` over time, to zoom into."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from jaxekf.reporting.plots._attitudes import euler_deg, same_turn
 from jaxekf.reporting.plots._biases import running_mean, told
 from jaxekf.reporting.plots._sight import seconds, truth
 from jaxekf.reporting.plots.style import AXES, MEASURED, TRUTH
-from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.reporting.report._comparison import ComparedResult
 from jaxekf.reporting.report._grid import Column, Grid, Place
 
 _ROW = 168
@@ -35,13 +35,13 @@ class Figure(NamedTuple):
 
 
 class _Measured(NamedTuple):
-    """What a sensor says of a vector, in the unit it is shown in."""
+    """A vector measured by a sensor, in the unit it is shown in."""
 
     t: Floats
     value: Floats
     """(M, 3)."""
     error: Floats | None
-    """(M, 3) value less truth, NaN where that is not known."""
+    """(M, 3) value minus truth, NaN if unknown."""
     label: str
     dots: bool
 
@@ -50,7 +50,7 @@ class _Vector(NamedTuple):
     """A vector over time, in the unit it is shown in."""
 
     labels: tuple[str, ...]
-    """Of each component."""
+    """Label of each component."""
     unit: str
     value: Floats
     sigma: Floats
@@ -59,12 +59,12 @@ class _Vector(NamedTuple):
     error_sigma: Floats
     measured: _Measured | None
     noisy: bool = False
-    """Whether each instant has noise of its own, so that truth stands before the estimate."""
+    """Whether the noise of each instant is independent, so that truth is drawn above the estimate."""
 
 
-def draw(seen: Evidence, bins: int) -> list[Figure]:
-    """All figures that result and recording can show, with `bins` spans of time for long series."""
-    makers: tuple[Callable[[Evidence, int], Figure | None], ...] = (
+def draw(compared: ComparedResult, bins: int) -> list[Figure]:
+    """All figures of a result and its recording; long series are thinned to `bins` spans of time."""
+    makers: tuple[Callable[[ComparedResult, int], Figure | None], ...] = (
         attitude,
         rate,
         bias,
@@ -72,18 +72,18 @@ def draw(seen: Evidence, bins: int) -> list[Figure]:
         velocity,
         others,
     )
-    return [figure for make in makers if (figure := make(seen, bins)) is not None]
+    return [figure for make in makers if (figure := make(compared, bins)) is not None]
 
 
-def attitude(seen: Evidence, bins: int) -> Figure | None:
-    """Roll, pitch and yaw; errors as rotation vectors about the body's axes."""
-    output = seen.result.outputs.get("attitude")
+def attitude(compared: ComparedResult, bins: int) -> Figure | None:
+    """Roll, pitch and yaw; errors as rotation vectors in the body frame."""
+    output = compared.result.outputs.get("attitude")
     if output is None:
         return None
-    t, angles = seen.result.time, euler_deg(output.value)
+    t, angles = compared.result.time, euler_deg(output.value)
     true = error = measured = None
-    recording, sight = seen.recording, seen.sight
-    known = None if recording is None else truth(seen.result, recording)
+    recording, sight = compared.recording, compared.sight
+    known = None if recording is None else truth(compared.result, recording)
     if known is not None:
         true = same_turn(known.q_ref_body, t, t, angles)
         error = np.rad2deg(attitude_error(known.q_ref_body, output.value))
@@ -106,24 +106,24 @@ def attitude(seen: Evidence, bins: int) -> Figure | None:
         measured,
     )
     caption = (
-        f"Turns about z, y and x (yaw, pitch, roll) from {_frame(seen)} to the body. Errors are"
-        " rotation vectors about the body's axes, estimate less encoder."
+        f"Rotation from {_frame(compared)} to the body by yaw (z), pitch (y) and roll (x). Errors are"
+        " rotation vectors in the body frame, estimate minus encoder."
     )
-    return Figure("attitude", "Attitude", caption, _vector(seen, vector, bins))
+    return Figure("attitude", "Attitude", caption, _vector(compared, vector, bins))
 
 
-def _frame(seen: Evidence) -> str:
-    """In words, what attitudes and positions are told in."""
-    return "the reference frame" if seen.sight is None else seen.sight.frame
+def _frame(compared: ComparedResult) -> str:
+    """Reference frame of attitudes and positions, in words."""
+    return "the reference frame" if compared.sight is None else compared.sight.frame
 
 
-def rate(seen: Evidence, bins: int) -> Figure | None:
-    """Angular rate beside the gyroscope's."""
-    output = seen.result.outputs.get("rate")
+def rate(compared: ComparedResult, bins: int) -> Figure | None:
+    """Angular rate, estimate and gyroscope."""
+    output = compared.result.outputs.get("rate")
     if output is None:
         return None
     true = error = measured = None
-    recording, result = seen.recording, seen.result
+    recording, result = compared.recording, compared.result
     if recording is not None and recording.encoder is not None:
         true = np.rad2deg(encoder_rate_at(recording.encoder, result.time_ns))
         error = np.rad2deg(output.value) - true
@@ -139,18 +139,18 @@ def rate(seen: Evidence, bins: int) -> Figure | None:
     vector = _Vector(
         AXES, "deg/s", np.rad2deg(output.value), sigma, true, error, sigma, measured, noisy=True
     )
-    caption = "Angular rate of the tool in the body frame, the gyroscope as it was recorded."
-    return Figure("rate", "Angular rate", caption, _vector(seen, vector, bins))
+    caption = "Angular rate of the tool in the body frame; the gyroscope is shown as recorded."
+    return Figure("rate", "Angular rate", caption, _vector(compared, vector, bins))
 
 
-def position(seen: Evidence, bins: int) -> Figure | None:
+def position(compared: ComparedResult, bins: int) -> Figure | None:
     """Position of the body's origin."""
-    output = seen.result.outputs.get("position")
+    output = compared.result.outputs.get("position")
     if output is None:
         return None
     true = error = measured = None
-    recording, sight = seen.recording, seen.sight
-    known = None if recording is None else truth(seen.result, recording)
+    recording, sight = compared.recording, compared.sight
+    known = None if recording is None else truth(compared.result, recording)
     if known is not None and known.position is not None:
         true = np.where(known.valid[:, None], 1e3 * known.position, np.nan)
         error = 1e3 * output.value - true
@@ -163,38 +163,38 @@ def position(seen: Evidence, bins: int) -> Figure | None:
         measured = _Measured(sight.t, raw, off, sight.label, True)
     sigma = 1e3 * output.sigma
     vector = _Vector(AXES, "mm", 1e3 * output.value, sigma, true, error, sigma, measured)
-    caption = f"Position of the body's origin in {_frame(seen)}."
-    return Figure("position", "Position", caption, _vector(seen, vector, bins))
+    caption = f"Position of the body's origin in {_frame(compared)}."
+    return Figure("position", "Position", caption, _vector(compared, vector, bins))
 
 
-def velocity(seen: Evidence, bins: int) -> Figure | None:
-    """Velocity of the body's origin, of which no sensor tells."""
-    output = seen.result.outputs.get("velocity")
+def velocity(compared: ComparedResult, bins: int) -> Figure | None:
+    """Velocity of the body's origin, which no sensor measures."""
+    output = compared.result.outputs.get("velocity")
     if output is None:
         return None
     true = error = None
-    encoder = None if seen.recording is None else seen.recording.encoder
+    encoder = None if compared.recording is None else compared.recording.encoder
     if encoder is not None and encoder.position is not None:
-        true = 1e3 * encoder_velocity_at(encoder, seen.result.time_ns)
+        true = 1e3 * encoder_velocity_at(encoder, compared.result.time_ns)
         error = 1e3 * output.value - true
     sigma = 1e3 * output.sigma
     vector = _Vector(AXES, "mm/s", 1e3 * output.value, sigma, true, error, sigma, None)
-    caption = f"Velocity of the body's origin in {_frame(seen)}."
-    return Figure("velocity", "Velocity", caption, _vector(seen, vector, bins))
+    caption = f"Velocity of the body's origin in {_frame(compared)}."
+    return Figure("velocity", "Velocity", caption, _vector(compared, vector, bins))
 
 
-def bias(seen: Evidence, bins: int) -> Figure | None:
-    """Biases of the gyroscope and, where the model has it, of the accelerometer."""
-    turning, force = seen.result.vector("bias"), seen.result.vector("accelerometer_bias")
+def bias(compared: ComparedResult, bins: int) -> Figure | None:
+    """Bias of the gyroscope and, if the model has it, of the accelerometer."""
+    turning, force = compared.result.vector("bias"), compared.result.vector("accelerometer_bias")
     if turning is None:
         return None
-    t = seen.result.time
-    columns = [_timed(seen)] if force is None else [_timed(seen), _timed(seen)]
+    t = compared.result.time
+    columns = [_timed(compared)] if force is None else [_timed(compared), _timed(compared)]
     grid = Grid(columns, 3, row_height=_ROW, bins=bins)
-    recording, known = seen.recording, None
+    recording, known = compared.recording, None
     if recording is not None and recording.imu is not None:
-        known = told(seen.result, recording)
-    shade(grid, seen)
+        known = told(compared.result, recording)
+    shade(grid, compared)
     for i, axis in enumerate(AXES):
         at = Place(i)
         value, sigma = (np.rad2deg(array[:, i]) for array in turning)
@@ -213,13 +213,13 @@ def bias(seen: Evidence, bins: int) -> Figure | None:
             grid.estimate(at, t, value, sigma, unit="m/s²", width=1.4)
     caption = "Bias of the gyroscope" + (" and of the accelerometer." if force else ".")
     if known is not None and known.at_rest is not None:
-        caption += " Dashed: what the gyroscope said while the encoder stood still at the start."
+        caption += " Dashed: mean of the gyroscope while the encoder was at rest at the start."
     return Figure("bias", "Bias", caption, grid.document())
 
 
-def others(seen: Evidence, bins: int) -> Figure | None:
-    """What else a model of one's own has in its state, number by number, in its own units."""
-    result = seen.result
+def others(compared: ComparedResult, bins: int) -> Figure | None:
+    """Further states of a user's model, number by number, in their own units."""
+    result = compared.result
     left = [
         label
         for label in result.labels
@@ -228,33 +228,37 @@ def others(seen: Evidence, bins: int) -> Figure | None:
     ][:_MOST_OTHERS]
     if not left:
         return None
-    grid = Grid([_timed(seen)], len(left), row_height=_ROW, bins=bins)
-    shade(grid, seen)
+    grid = Grid([_timed(compared)], len(left), row_height=_ROW, bins=bins)
+    shade(grid, compared)
     for i, label in enumerate(left):
         value, sigma = result.columns[label], result.columns[f"sigma_{label}"]
         unit = result.units.get(label, "")
         grid.axis(Place(i), f"{label} ({unit})", _settled(result.time, value, sigma))
         grid.estimate(Place(i), result.time, value, sigma, unit=unit)
-    return Figure("state", "Other states", "The rest of the model's state.", grid.document())
+    return Figure("state", "Other states", "Further states of the model.", grid.document())
 
 
-def _timed(seen: Evidence) -> Column:
+def _timed(compared: ComparedResult) -> Column:
     """A column over the whole time of the run."""
-    return Column("time since the start of the estimate (s)", (0.0, float(seen.result.time[-1])))
+    return Column(
+        "time since the start of the estimate (s)", (0.0, float(compared.result.time[-1]))
+    )
 
 
-def shade(grid: Grid, seen: Evidence) -> None:
-    """Grey where there is no pose of tracker or camera."""
-    grid.shade(seen.lost, "tracker hidden" if seen.sight is None else seen.sight.words[0])
+def shade(grid: Grid, compared: ComparedResult) -> None:
+    """Grey bands for stretches without a pose of tracker or camera."""
+    grid.shade(
+        compared.gaps, "tracker hidden" if compared.sight is None else compared.sight.words[0]
+    )
 
 
-def _vector(seen: Evidence, vector: _Vector, bins: int) -> dict[str, Any]:
-    """A row for each component; on the right its error, where truth is known."""
-    t, columns = seen.result.time, [_timed(seen)]
+def _vector(compared: ComparedResult, vector: _Vector, bins: int) -> dict[str, Any]:
+    """A row for each component; on the right its error, if truth is known."""
+    t, columns = compared.result.time, [_timed(compared)]
     if vector.error is not None:
-        columns.append(_timed(seen))
+        columns.append(_timed(compared))
     grid = Grid(columns, 3, row_height=_ROW, bins=bins)
-    shade(grid, seen)
+    shade(grid, compared)
     for i, label in enumerate(vector.labels):
         _value(grid, Place(i), t, vector, i, label)
         if vector.error is not None:
@@ -266,7 +270,7 @@ def _value(grid: Grid, at: Place, t: Floats, vector: _Vector, i: int, label: str
     grid.axis(at, f"{label} ({vector.unit})", _limits(vector, i))
     measured, unit = vector.measured, vector.unit
 
-    def tell_truth() -> None:
+    def draw_truth() -> None:
         if vector.truth is not None:
             width = 1.0 if vector.noisy else 2.4
             true = vector.truth[:, i]
@@ -275,12 +279,12 @@ def _value(grid: Grid, at: Place, t: Floats, vector: _Vector, i: int, label: str
     if measured is not None:
         _measurement(grid, at, measured, measured.value[:, i], unit)
     if not vector.noisy:
-        tell_truth()
-    # About a curve that has noise of its own at each instant a band is a second noisy curve.
+        draw_truth()
+    # A band about a noisy curve would be a second noisy curve.
     about = "none" if vector.noisy else "value"
     grid.estimate(at, t, vector.value[:, i], vector.sigma[:, i], unit=unit, about=about)
     if vector.noisy:
-        tell_truth()
+        draw_truth()
 
 
 def _error(grid: Grid, at: Place, t: Floats, vector: _Vector, error: Floats, i: int) -> None:
@@ -309,7 +313,7 @@ def _measurement(grid: Grid, at: Place, measured: _Measured, values: Floats, uni
 
 
 def _limits(vector: _Vector, i: int) -> tuple[float, float]:
-    """The range of the curves: a wide band at the start, or a stray sample, must not flatten them."""
+    """Range of the curves, not widened by the band at the start or by outliers."""
     values = vector.value[:, i]
     if vector.measured is not None:
         raw = vector.measured.value[:, i]
@@ -321,7 +325,7 @@ def _limits(vector: _Vector, i: int) -> tuple[float, float]:
 
 
 def _symmetric(values: Floats) -> tuple[float, float] | None:
-    """A range about zero that single outliers do not rule."""
+    """A range about zero, not widened by outliers."""
     known = np.abs(values[np.isfinite(values)])
     if not known.size:
         return None
@@ -330,7 +334,7 @@ def _symmetric(values: Floats) -> tuple[float, float] | None:
 
 
 def _settled(t: Floats, value: Floats, sigma: Floats) -> tuple[float, float]:
-    """A range that the wide band of the start does not rule."""
+    """A range that is not widened by the band at the start."""
     settled = t >= min(2.0, 0.1 * float(t[-1]))
     middle, reach = float(np.median(value[settled])), 5.0 * float(np.median(sigma[settled]))
     reach = max(reach, 2.0 * float(np.ptp(value[settled])), 1e-12)

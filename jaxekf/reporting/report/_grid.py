@@ -1,6 +1,6 @@
 """Plotly figures as plain JSON documents: rows and columns of panels that share their time axis.
 
-What looks alike in all figures stands here. A figure has one set of colours; the page's style sheet turns
+The common style of all figures is here. A figure has one set of colours; the page's style sheet turns
 those of `PALETTE` into others on a dark screen.
 """
 
@@ -19,7 +19,7 @@ PALETTE = {
     REFUSED: "#ff7070",
     THIRD: "#8fd17a",
 }
-"""Each colour of the figures, and what stands for it on a dark screen."""
+"""Each colour of the figures, and its replacement on a dark screen."""
 ESTIMATED = "estimate"
 SHADE = "rgba(128,128,128,0.24)"
 LINES = "rgba(128,128,128,0.28)"
@@ -107,7 +107,7 @@ class Grid:
         width: float = 1.2,
     ) -> None:
         """An estimate with its band of 2 sigma (which the page draws) `about` its ``value`` or ``zero``;
-        for ``none`` it is told only."""
+        for ``none`` the band is in the hover text only."""
         drawn = thin(t, values, self._bins)
         extra = {
             "mode": "lines",
@@ -191,7 +191,7 @@ class Grid:
             self.key(name, SHADE)
 
     def key(self, name: str, colour: str, *, opacity: float = 1.0) -> None:
-        """An entry of the legend for what is no curve."""
+        """An entry of the legend without a curve."""
         marker = {"symbol": "square", "size": 12, "color": colour, "opacity": opacity}
         self._data.append(
             {
@@ -206,7 +206,7 @@ class Grid:
         )
 
     def document(self) -> dict[str, Any]:
-        """Data and layout, as Plotly takes them but for bands and the columns' places (`page.html`)."""
+        """Data and layout, for Plotly; `figures.js` adds bands and the domains of the columns."""
         if self._banded:
             self.key("2σ of the estimate", ESTIMATE, opacity=0.3)
         shares = [column.share for column in self._columns]
@@ -268,7 +268,7 @@ class Grid:
 
 
 def common_layout(height: int, shares: Sequence[float] = (1.0,)) -> dict[str, Any]:
-    """What looks alike in every figure; the page sets columns of these `shares` side by side."""
+    """Layout of every figure; `figures.js` places columns of these `shares` side by side."""
     return {
         "height": height,
         "margin": {"l": 64, "r": 16, "t": _TOP, "b": _BOTTOM},
@@ -282,7 +282,7 @@ def common_layout(height: int, shares: Sequence[float] = (1.0,)) -> dict[str, An
 
 
 def axis_style(title: str) -> dict[str, Any]:
-    """Title and lines of an axis of a figure that is no `Grid`."""
+    """Title and lines of an axis of a figure without `Grid`."""
     lines = {"gridcolor": LINES, "zerolinecolor": LINES, "linecolor": LINES}
     return {"title": {"text": title, "standoff": 6, "font": {"size": 11}}, **lines}
 
@@ -293,7 +293,7 @@ def rounded_pair(limits: tuple[float, float]) -> list[float]:
 
 
 def _before_breaks(drawn: Thinned) -> Any:
-    """The index of each drawn sample; at a break that of the one before, so that a band goes on."""
+    """The index of each drawn sample; at a break that of the one before, so that a band continues."""
     index = drawn.samples.copy()
     breaks = index < 0
     index[breaks] = index[(breaks.nonzero()[0] - 1).clip(0)]

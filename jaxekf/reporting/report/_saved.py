@@ -1,18 +1,20 @@
-"""Result folders of `jaxekf estimate`, read again: what a report needs, without model or filter."""
+"""A result folder of `jaxekf estimate` read into memory, without model or filter."""
 
-import json
 import tomllib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import UnsetType
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.estimation.result import OutputEstimate
 from jaxekf.io.csv_table import numbers, read_table, read_times
+from jaxekf.io.documents import codec
+from jaxekf.io.documents.result import DiagnosisDocument, ResultDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Times
 
@@ -20,18 +22,6 @@ _AGAIN = "estimating the run again with this version of jaxekf"
 _KINDS = ("result.json", "tuning.json")
 _EXPECTED = "a result folder of jaxekf estimate or a tuned folder of jaxekf tune"
 _AXES = ("x", "y", "z")
-_NEEDED: Mapping[str, type | tuple[type, ...]] = {
-    "run": str,
-    "model": str,
-    "smoothed": bool,
-    "duration_s": (int, float),
-    "mean_nis": dict,
-    "account": dict,
-    "notes": list,
-    "estimate_columns": list,
-    "innovation_units": dict,
-    "provenance": dict,
-}
 
 
 class SavedSensor(NamedTuple):
@@ -39,15 +29,14 @@ class SavedSensor(NamedTuple):
 
     time_ns: Times
     nis: Floats
-    """(N,) chi-square with as many degrees as visible rows."""
     freedom: Floats
-    """(N,) visible rows."""
+    """(N,) visible rows, the degrees of freedom."""
     refused: Flags
-    """(N,) samples that the gate kept out whole."""
+    """(N,) samples of which the gate refused all rows."""
 
 
 class Setting(NamedTuple):
-    """One leaf of the parameters an estimate was made with."""
+    """One parameter that an estimate was made with."""
 
     section: str
     """`noise`, `initial` or `calibration`."""
@@ -64,18 +53,17 @@ class SavedResult:
     run: str
     time_ns: Times
     labels: tuple[str, ...]
-    """Of the rows of the covariance."""
+    """Labels of the rows of the covariance."""
     columns: dict[str, Floats]
     """`estimate.csv`: each column (N,), SI."""
     units: dict[str, str]
-    """Of the columns."""
+    """Unit of each column."""
     cov: Floats
     """(N, n, n), SI."""
     outputs: dict[str, OutputEstimate]
     sensors: dict[str, SavedSensor]
     settings: tuple[Setting, ...]
-    document: Mapping[str, Any]
-    """`result.json`."""
+    document: ResultDocument
 
     @property
     def time(self) -> Floats:
@@ -83,20 +71,20 @@ class SavedResult:
         return (self.time_ns - self.time_ns[0]) / NANOSECONDS
 
     @property
-    def diagnosis(self) -> Mapping[str, Any] | None:
-        """As `Diagnosis.as_dict` with curves; None where none was saved."""
-        return self.document.get("diagnosis")
+    def diagnosis(self) -> DiagnosisDocument | None:
+        """The saved diagnosis, if any."""
+        found = self.document.diagnosis
+        return None if isinstance(found, UnsetType) else found
 
     @property
     def model(self) -> str:
         """Name of the model, and how it was used."""
-        how = ", smoothed" if self.document["smoothed"] else ""
-        # Results of earlier versions do not tell.
-        how += ", as known at each time" if self.document.get("online") else ""
-        return f"{self.document['model']}{how}"
+        how = ", smoothed" if self.document.smoothed else ""
+        how += ", as known at each time" if self.document.online else ""
+        return f"{self.document.model}{how}"
 
     def vector(self, name: str) -> tuple[Floats, Floats] | None:
-        """Value and deviation (N, 3) of a part of the state; None where the model has no such part."""
+        """Value and standard deviation (N, 3) of a part of the state; None if there is no such part."""
         wanted = [f"{name}_{axis}" for axis in _AXES]
         if not all(w in self.columns and f"sigma_{w}" in self.columns for w in wanted):
             return None
@@ -107,12 +95,12 @@ class SavedResult:
 def read_result(folder: Path | str) -> SavedResult:
     """Read a result folder.
 
-    Raises `RecordingError`, which names the file, for a folder that is none, a file that is missing or
-    broken, and a result of another version.
+    Raises `RecordingError`, which names the file, for a folder that is not a result, a file that is missing
+    or broken, and a result of another version.
     """
     folder = Path(folder)
     document = _read_document(folder)
-    arrays = _read_arrays(folder / "covariance.npz")
+    arrays = _read_arrays(folder / "covariance.npz", ("time_ns", "cov", "labels"))
     table_file = _existing(folder / "estimate.csv")
     table = read_table(table_file)
     names = [column for column in table.columns if column != "time"]
@@ -121,25 +109,16 @@ def read_result(folder: Path | str) -> SavedResult:
     time_ns = arrays["time_ns"]
     if not np.array_equal(read_times(table), time_ns):
         raise RecordingError(table_file, "other times than covariance.npz", "the same", _AGAIN)
-    described = document["estimate_columns"]
     return SavedResult(
         folder=folder,
-        run=document["run"],
+        run=document.run,
         time_ns=time_ns,
         labels=tuple(str(label) for label in arrays["labels"]),
         columns=columns,
-        units={
-            entry["name"]: entry["unit"]
-            for entry in described
-            if isinstance(entry, dict) and {"name", "unit"} <= entry.keys()
-        },
+        units={column.name: column.unit for column in document.estimate_columns},
         cov=arrays["cov"],
         outputs=_outputs(columns, arrays),
-        sensors={
-            name: _read_sensor(_existing(folder / f"innovations_{name}.csv"))
-            for name in document["innovation_units"]
-            if document["mean_nis"].get(name) is not None
-        },
+        sensors=_read_sensors(folder, document),
         settings=_read_settings(folder),
         document=document,
     )
@@ -153,8 +132,8 @@ def _existing(file: Path) -> Path:
     return file
 
 
-def _read_document(folder: Path) -> dict[str, Any]:
-    """`result.json`, of a version and kind that is known."""
+def _read_document(folder: Path) -> ResultDocument:
+    """Read `result.json`, or say why the folder is not a result."""
     file = folder / "result.json"
     if not folder.is_dir():
         raise RecordingError(folder, "no such folder", _EXPECTED, "another path")
@@ -165,37 +144,11 @@ def _read_document(folder: Path) -> dict[str, Any]:
         if (folder / "noise.toml").is_file():
             hint = "tuning again with this version of jaxekf, if it was tuned"
         raise RecordingError(folder, f"a folder without {' or '.join(_KINDS)}", _EXPECTED, hint)
-    try:
-        document = json.loads(file.read_text("utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RecordingError(file, f"text that is not JSON ({error})", "JSON", _AGAIN) from error
-    version = document.get("schema_version") if isinstance(document, dict) else None
-    if version != SCHEMA_VERSION:
-        raise RecordingError(file, f"schema_version {version!r}", f"{SCHEMA_VERSION}", _AGAIN)
-    for key, kind in _NEEDED.items():
-        if not isinstance(document.get(key), kind):
-            raise RecordingError(
-                file, f"{key} = {document.get(key)!r}", "what jaxekf estimate writes there", _AGAIN
-            )
-    if "diagnosis" in document:
-        _check_diagnosis(file, document["diagnosis"])
-    return document
+    return codec.read(file, ResultDocument, _AGAIN)
 
 
-def _check_diagnosis(file: Path, diagnosis: Any) -> None:
-    """It may have been saved from Python, where anything can be handed over."""
-    for key, kind in {"verdicts": list, "notes": list, "sensors": dict, "parts": dict}.items():
-        if not isinstance(diagnosis, dict) or not isinstance(diagnosis.get(key), kind):
-            raise RecordingError(
-                file,
-                f"a diagnosis without {key}",
-                "what Diagnosis.as_dict returns",
-                "saving the result with that",
-            )
-
-
-def _read_arrays(file: Path) -> dict[str, Any]:
-    """All arrays of `covariance.npz`."""
+def _read_arrays(file: Path, needed: Sequence[str]) -> dict[str, Any]:
+    """All arrays of an NPZ file, in which those that are `needed` must be."""
     try:
         with np.load(_existing(file), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -203,9 +156,9 @@ def _read_arrays(file: Path) -> dict[str, Any]:
         raise RecordingError(
             file, f"a file that cannot be read ({error})", "a NumPy archive", _AGAIN
         ) from error
-    missing = [name for name in ("time_ns", "cov", "labels") if name not in arrays]
+    missing = [name for name in needed if name not in arrays]
     if missing:
-        raise RecordingError(file, f"no {', '.join(missing)}", "them", _AGAIN)
+        raise RecordingError(file, f"no {', '.join(missing)}", "these arrays", _AGAIN)
     if arrays.get("schema_version") != SCHEMA_VERSION:
         got = f"schema_version {arrays.get('schema_version')}"
         raise RecordingError(file, got, f"{SCHEMA_VERSION}", _AGAIN)
@@ -213,7 +166,7 @@ def _read_arrays(file: Path) -> dict[str, Any]:
 
 
 def _outputs(columns: Mapping[str, Floats], arrays: Mapping[str, Any]) -> dict[str, OutputEstimate]:
-    """Those outputs whose values stand in `estimate.csv`, with their covariances."""
+    """The outputs with values in `estimate.csv`, and their covariances."""
     found = {}
     for key in arrays:
         name = key.removeprefix("cov_")
@@ -235,23 +188,36 @@ def _outputs(columns: Mapping[str, Floats], arrays: Mapping[str, Any]) -> dict[s
     return found
 
 
-def _read_sensor(file: Path) -> SavedSensor:
+def _read_sensors(folder: Path, document: ResultDocument) -> dict[str, SavedSensor]:
+    """NIS of all sensors with samples: to the last bit, or from the tables of earlier versions."""
+    names = [name for name in document.innovation_units if document.mean_nis.get(name) is not None]
+    if isinstance(document.innovations, UnsetType):
+        return {name: _read_table(_existing(folder / f"innovations_{name}.csv")) for name in names}
+    columns = ("time_ns", "nis", "used", "gated")
+    needed = [f"sensors/{name}/{column}" for name in names for column in columns]
+    arrays = _read_arrays(folder / document.innovations.file, needed)
+    return {name: _sensor(*(arrays[f"sensors/{name}/{c}"] for c in columns)) for name in names}
+
+
+def _read_table(file: Path) -> SavedSensor:
+    """`innovations_SENSOR.csv`."""
     table = read_table(file)
     used = [name for name in table.columns if name.split("_")[0] == "used"]
     gated = [name for name in table.columns if name.split("_")[0] == "gated"]
     if "nis" not in table.columns or not used or len(used) != len(gated):
         raise RecordingError(file, "other columns", "those of jaxekf estimate", _AGAIN)
-    taken, kept_out = numbers(table, used) > 0, numbers(table, gated) > 0
-    return SavedSensor(
-        read_times(table),
-        numbers(table, ("nis",), blank=True)[:, 0],
-        (taken | kept_out).sum(axis=1).astype(float),
-        np.asarray(kept_out.any(axis=1) & ~taken.any(axis=1)),
-    )
+    nis = numbers(table, ("nis",), blank=True)[:, 0]
+    return _sensor(read_times(table), nis, numbers(table, used) > 0, numbers(table, gated) > 0)
+
+
+def _sensor(time_ns: Times, nis: Floats, used: Flags, gated: Flags) -> SavedSensor:
+    """NIS of one sensor, its rows (N, rows) used and gated."""
+    refused = np.asarray(gated.any(axis=1) & ~used.any(axis=1))
+    return SavedSensor(time_ns, nis, (used | gated).sum(axis=1).astype(float), refused)
 
 
 def _read_settings(folder: Path) -> tuple[Setting, ...]:
-    """Noise, initial belief and, where the model has any, calibration."""
+    """Noise, initial belief and calibration."""
     found = []
     files = [_existing(folder / "noise.toml"), folder / "calibration.toml"]
     for file in (f for f in files if f.is_file()):

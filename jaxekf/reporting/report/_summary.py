@@ -1,10 +1,11 @@
-"""A run in one row: how large its errors are, before and after, and what speaks against it."""
+"""A run in one row: its errors before and after, and its verdicts."""
 
 import math
 from typing import Any, NamedTuple
 
 from jaxekf.estimation.result import trackers
-from jaxekf.reporting.report._evidence import Evidence
+from jaxekf.io.documents.result import SquaresTest
+from jaxekf.reporting.report._comparison import ComparedResult
 
 _NAN = float("nan")
 
@@ -19,7 +20,7 @@ class Number(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """Numbers are NaN where there is nothing to tell them."""
+    """Numbers of one run; NaN is unknown."""
 
     model: str
     duration_s: float
@@ -57,52 +58,50 @@ NUMBERS = (
 
 
 def shown(value: Any, decimals: int) -> str:
-    """A number with so many decimals; a dash for none."""
+    """A number with the given number of decimals; a dash for none."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{decimals}f}"
 
 
-def summarise(seen: Evidence) -> Summary:
-    """The row of one run."""
-    document, score = seen.result.document, seen.score
-    account, mean_nis = document["account"], document["mean_nis"]
+def summarise(compared: ComparedResult) -> Summary:
+    """Numbers and verdicts of one run."""
+    document, score = compared.result.document, compared.score
+    account, mean_nis = document.account, document.mean_nis
     seeing = trackers(account)
     known = [v for v in (mean_nis.get(name) for name in seeing) if v is not None]
     return Summary(
-        model=seen.result.model,
-        duration_s=float(document["duration_s"]),
-        samples=len(seen.result.time_ns),
+        model=compared.result.model,
+        duration_s=document.duration_s,
+        samples=len(compared.result.time_ns),
         tracker_used=sum(account[name].get("used", 0) for name in seeing),
         tracker_read=sum(account[name].get("read", 0) for name in seeing),
-        held_attitude_deg=seen.held_deg,
+        held_attitude_deg=compared.hold_last_deg,
         attitude_rmse_deg=_NAN if score is None else score.attitude_rmse_deg,
-        gyroscope_rmse_deg_s=seen.raw_rate_deg_s,
+        gyroscope_rmse_deg_s=compared.raw_rate_deg_s,
         rate_rmse_deg_s=_NAN if score is None else score.rate_rmse_deg_s,
         position_rmse_mm=_NAN if score is None else score.position_rmse_mm,
         attitude_nees=_NAN if score is None else score.attitude_nees,
         position_nees=_NAN if score is None else score.position_nees,
         tracker_nis=sum(known) / len(known) if known else _NAN,
-        verdicts=_verdicts(seen),
+        verdicts=_verdicts(compared),
     )
 
 
-def _verdicts(seen: Evidence) -> tuple[str, ...]:
-    """What the saved diagnosis says, as `Diagnosis.sentences` does."""
-    found = seen.result.diagnosis
+def _verdicts(compared: ComparedResult) -> tuple[str, ...]:
+    """Sentences of the saved diagnosis, as `Diagnosis.sentences` makes them."""
+    found = compared.result.diagnosis
     if found is None:
         return (
             "no diagnosis is saved in this result: estimate the run again by jaxekf estimate, or save it"
             " with diagnosis=jaxekf.diagnose(estimate, run).as_dict(curves=True)",
         )
-    if found["verdicts"]:
-        return tuple(str(verdict.get("sentence", verdict)) for verdict in found["verdicts"])
-    told = [_told(f"NIS of {name}", each.get("nis", {})) for name, each in found["sensors"].items()]
-    told += [_told(f"NEES of {name}", each) for name, each in found["parts"].items()]
-    numbers = "; ".join(text for text in told if text)
-    return (f"nothing speaks against it: {numbers}",) if numbers else ("too little to judge",)
+    if found.verdicts:
+        return tuple(verdict.sentence for verdict in found.verdicts)
+    tests = [(f"NIS of {name}", sensor.nis) for name, sensor in found.sensors.items()]
+    tests += [(f"NEES of {name}", part) for name, part in found.parts.items()]
+    numbers = "; ".join(_mean(name, test) for name, test in tests if test.samples)
+    return (f"no fault found: {numbers}",) if numbers else ("too few samples to judge",)
 
 
-def _told(about: str, squares: dict[str, Any]) -> str:
-    if not squares.get("samples"):
-        return ""
-    low, high = squares["interval"]
-    return f"{about} {squares['mean']:.2f} ({low:.2f} to {high:.2f})"
+def _mean(name: str, test: SquaresTest) -> str:
+    low, high = test.interval
+    return f"{name} {shown(test.mean, 2)} ({shown(low, 2)} to {shown(high, 2)})"

@@ -1,4 +1,4 @@
-"""Series thinned for display: extremes are kept, what is missing stays missing, numbers are short."""
+"""Series thinned for display: extremes and gaps are kept, numbers are short."""
 
 import math
 from typing import NamedTuple
@@ -27,12 +27,12 @@ class Thinned(NamedTuple):
 
 
 def thin(t: Floats, values: Floats, bins: int, *, line: bool = True) -> Thinned:
-    """Of times (N,) and values (N,) the smallest and the largest finite sample in each of `bins` equal
-    spans of time; all of them where they are few. Of dots, which are no `line`, in each of half as many
-    spans two others besides: extremes alone would look like two clouds.
+    """Thin times (N,) and values (N,) to the smallest and the largest finite sample in each of `bins` equal
+    spans of time; few samples are all kept. Dots (not a `line`) keep two further samples in each of half as
+    many spans: extremes alone would look like two clouds.
 
-    Of a line, a break stands wherever samples between two drawn ones are not finite, or further apart
-    than two and a half periods: nothing is drawn across what is missing.
+    A line has a break wherever samples between two drawn ones are not finite, or further apart
+    than two and a half periods: nothing is drawn across missing samples.
     """
     finite = np.isfinite(values)
     kept = np.flatnonzero(finite)
@@ -61,7 +61,7 @@ def thin(t: Floats, values: Floats, bins: int, *, line: bool = True) -> Thinned:
 
 
 def rounded(values: Floats) -> list[float | int | None]:
-    """Numbers for JSON, with so many decimals that rounding is not seen; null where not finite."""
+    """Numbers for JSON, with enough decimals that rounding is not visible; null where not finite."""
     values = np.asarray(values, float)
     known = values[np.isfinite(values)]
     spread = float(np.ptp(known)) if known.size else 0.0

@@ -1,4 +1,4 @@
-"""Figures of a tuning: its search, runs before and after it, and how well each number is known."""
+"""Figures of a tuning: its search, runs before and after it, and confidence intervals."""
 
 import html
 import math
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf.io.documents.tuning import FreeNumber, RunScore, Step, TuningDocument
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
 from jaxekf.reporting.report._figures import Figure
 from jaxekf.reporting.report._grid import THIRD, axis_style, common_layout
@@ -18,7 +19,7 @@ _MOST_TICKS = 60
 _FAR = 20.0
 _SYMBOLS = ("diamond", "square", "cross", "triangle-up")
 _OTHERS = (THIRD, REFUSED, TRUTH)
-_HONEST = (0.5, 2.0)
+_CONSISTENT = (0.5, 2.0)
 COLUMNS = (
     ("attitude_rmse_deg", "attitude RMSE", "deg"),
     ("rate_rmse_deg_s", "rate RMSE", "deg/s"),
@@ -30,37 +31,37 @@ COLUMNS = (
 """Columns of the tables of runs, their headings and units."""
 
 
-def draw_tuning(document: dict[str, Any]) -> list[Figure]:
-    """All figures that the record of a tuning can show."""
-    again = any(number["left_open"] for number in document["numbers"])
-    found = [search(document["history"], document["best_iteration"], again=again)]
-    if document["rows"]:
-        found.append(compared("compared", "Runs before and after", document["rows"]))
-    if document["folds"] is not None:
-        found.append(compared("folds", "Held-out runs before and after", document["folds"]["rows"]))
-    return [figure for figure in [*found, intervals(document["numbers"])] if figure]
+def draw_tuning(document: TuningDocument) -> list[Figure]:
+    """All figures of a tuning."""
+    again = any(number.left_open for number in document.numbers)
+    found = [search(document.history, document.best_iteration, again=again)]
+    if document.rows:
+        found.append(compared("compared", "Runs before and after", document.rows))
+    if document.folds is not None:
+        found.append(compared("folds", "Held-out runs before and after", document.folds.rows))
+    return [figure for figure in [*found, intervals(document.numbers)] if figure]
 
 
-def known_columns(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str, str]]:
+def known_columns(rows: Sequence[RunScore]) -> list[tuple[str, str, str]]:
     """The columns in which any row has a number."""
-    return [c for c in COLUMNS if any(row[c[0]] is not None for row in rows)]
+    return [c for c in COLUMNS if any(getattr(row, c[0]) is not None for row in rows)]
 
 
-def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False) -> Figure | None:
-    """The objective of training and validation runs against the iteration; `again` where it went on with
-    some numbers back at their start."""
+def search(history: Sequence[Step], best: int, *, again: bool = False) -> Figure | None:
+    """The objective of training and validation runs over the iterations; `again` after a restart with
+    unobservable parameters at their initial values."""
     kinds = [
         kind
         for kind in ("training", "validation")
-        if any(step[kind] is not None and not step["rejected"] for step in history)
+        if any(getattr(step, kind) is not None and not step.rejected for step in history)
     ]
     if not kinds:
         return None
-    numbers = [step["number"] for step in history]
+    numbers = [step.number for step in history]
     data, layout, above = [], _panels(len(kinds)), 0
     for i, (kind, colour) in enumerate(zip(kinds, (ESTIMATE, MEASURED), strict=False)):
         y_axis = _axis_of("y", i)
-        values = [None if step["rejected"] else step[kind] for step in history]
+        values = [None if step.rejected else getattr(step, kind) for step in history]
         style: dict[str, Any] = {"type": "scatter", "xaxis": "x", "yaxis": y_axis}
         line = {"color": colour, "width": 1.4}
         data.append(
@@ -78,9 +79,9 @@ def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False)
                 | {"mode": "markers", "marker": marker, "hoverinfo": "skip", "showlegend": i == 0}
                 | {"legendgroup": "best"}
             )
-        if refused := _refused(history, kind):
+        if rejected := _rejected(history, kind):
             marker = {"color": REFUSED, "size": 8, "symbol": "x"}
-            where = {"x": [x for x, _ in refused], "y": [y for _, y in refused]}
+            where = {"x": [x for x, _ in rejected], "y": [y for _, y in rejected]}
             data.append(
                 style
                 | where
@@ -102,36 +103,35 @@ def search(history: Sequence[dict[str, Any]], best: int, *, again: bool = False)
     }
     layout["hovermode"] = "x unified"
     caption = (
-        "Each iteration is one evaluation; steps that the search tried and went back from are among them."
-        " The best is told by the validation runs where there are any."
+        "Each iteration is one evaluation, including steps that the search took back. The best iteration"
+        " is chosen by the validation runs, if there are any."
     )
     if again:
         caption += (
-            " What the data leave open went back to its start, and the search went on: lower values before"
-            " that do not count."
+            " Unobservable parameters reverted to their initial values, and the search continued: lower"
+            " values before that do not count."
         )
-    if any(step["rejected"] for step in history):
-        caption += " Rejected steps stand at the level of the step before them: they have no value."
+    if any(step.rejected for step in history):
+        caption += " Rejected steps have no value: they are drawn at the level of the step before."
     if above:
-        caption += f" {above} values lie above the range shown."
+        caption += f" {above} values are above the range shown."
     return Figure("search", "The search", caption, {"data": data, "layout": layout})
 
 
-def _refused(history: Sequence[dict[str, Any]], kind: str) -> list[tuple[int, float]]:
-    """Where to draw rejected steps: at the last value before them, or the first after."""
-    known = [step[kind] for step in history if step[kind] is not None and not step["rejected"]]
-    level, found = known[0], []
-    for step in history:
-        if step["rejected"]:
-            found.append((step["number"], level))
-        elif step[kind] is not None:
-            level = step[kind]
+def _rejected(history: Sequence[Step], kind: str) -> list[tuple[int, float]]:
+    """Iteration and level of rejected steps: the last value before them, or the first after."""
+    values = [None if step.rejected else getattr(step, kind) for step in history]
+    level, found = next(value for value in values if value is not None), []
+    for step, value in zip(history, values, strict=True):
+        if step.rejected:
+            found.append((step.number, level))
+        level = level if value is None else value
     return found
 
 
 def _limits(values: Sequence[float]) -> tuple[list[float], bool, int]:
-    """Range of an axis, whether it is logarithmic, and how many values lie above it: of steps that went
-    far astray the rest of the search would be a flat line."""
+    """Range of an axis, whether it is logarithmic, and the number of values above it: a range for all steps
+    could flatten the rest of the search."""
     low, high = min(values), max(values)
     if low > 0.0 and high > _FAR * low:
         return [math.log10(low) - 0.1, math.log10(high) + 0.1], True, 0
@@ -142,10 +142,10 @@ def _limits(values: Sequence[float]) -> tuple[list[float], bool, int]:
     return [low - margin, high + margin], False, sum(v > high for v in values)
 
 
-def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | None:
-    """A dot for each run and variant, one panel for each column; what holds the tracker is in the table."""
-    columns = known_columns([row for row in rows if row["variant"] != HELD])
-    runs = list(dict.fromkeys(row["run"] for row in rows))
+def compared(name: str, title: str, rows: Sequence[RunScore]) -> Figure | None:
+    """A dot for each run and variant, one panel for each column, without ``hold last``."""
+    columns = known_columns([row for row in rows if row.variant != HELD])
+    runs = list(dict.fromkeys(row.run for row in rows))
     if not columns:
         return None
     wide = min(len(columns), 2)
@@ -153,8 +153,8 @@ def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | 
     data: list[dict[str, Any]] = []
     for i, (column, head, unit) in enumerate(columns):
         place = {"type": "scatter", "xaxis": _axis_of("x", i % wide), "yaxis": _axis_of("y", i)}
-        told = {(row["run"], row["variant"]): row[column] for row in rows}
-        traces = _dots(rows, runs, told, unit)
+        values = {(row.run, row.variant): getattr(row, column) for row in rows}
+        traces = _dots(rows, runs, values, unit)
         data += [
             place | {"showlegend": False} | t for t in traces if i == 0 or t["mode"] == "lines"
         ]
@@ -164,7 +164,7 @@ def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | 
         known = [v for t in traces for v in t["y"] if v is not None]
         axis |= _scale(known, about_one=column in BEST_AT_ONE)
         if column in BEST_AT_ONE:
-            layout["shapes"] += _honest(place["xaxis"], place["yaxis"])
+            layout["shapes"] += _consistency_band(place["xaxis"], place["yaxis"])
     step = math.ceil(len(runs) / _MOST_TICKS)
     for i in range(wide):
         lowest = max(k for k in range(len(columns)) if k % wide == i)
@@ -179,27 +179,28 @@ def compared(name: str, title: str, rows: Sequence[dict[str, Any]]) -> Figure | 
             **({"matches": "x"} if i else {}),
         }
     layout["hovermode"] = "closest"
-    caption = "A dot for each run; the tracker held at its last sample is in the table only."
+    caption = "A dot for each run; “hold last” is in the table only."
     if any(column in BEST_AT_ONE for column, _, _ in columns):
-        low, high = _HONEST
+        low, high = _CONSISTENT
         caption += (
-            " NIS and NEES are 1 (the line) where the uncertainty is honest; the band goes from"
+            " NIS and NEES are 1 (the line) for a consistent filter; the band goes from"
             f" {low:g} to {high:g}."
         )
     return Figure(name, title, caption, {"data": data, "layout": layout})
 
 
 def _dots(
-    rows: Sequence[dict[str, Any]], runs: Sequence[str], told: dict[Any, Any], unit: str
+    rows: Sequence[RunScore], runs: Sequence[str], values: dict[Any, Any], unit: str
 ) -> list[dict[str, Any]]:
-    """Dots of each variant, before them lines from before to after."""
+    """Dots of each variant, and below them lines from before to after."""
     first, last = before_and_after(rows)
-    values = {
-        variant: [told.get((run, variant)) for run in runs] for variant in _drawn(rows, first, last)
+    by_variant = {
+        variant: [values.get((run, variant)) for run in runs]
+        for variant in _drawn(rows, first, last)
     }
-    found = [_links(values[first], values[last])] if first != last else []
+    found = [_links(by_variant[first], by_variant[last])] if first != last else []
     others = 0
-    for variant, each in values.items():
+    for variant, each in by_variant.items():
         colour, symbol = _OTHERS[others % len(_OTHERS)], _SYMBOLS[others % len(_SYMBOLS)]
         if variant in (first, last):
             colour, symbol = ESTIMATE if variant == last else MEASURED, "circle"
@@ -221,8 +222,8 @@ def _dots(
     return found
 
 
-def _drawn(rows: Sequence[dict[str, Any]], first: str, last: str) -> list[str]:
-    """Variants, so that the tuned one lies on top."""
+def _drawn(rows: Sequence[RunScore], first: str, last: str) -> list[str]:
+    """Variants in the order of drawing, the tuned one on top."""
     others = [name for name in variants(rows) if name not in (HELD, first, last)]
     return list(dict.fromkeys([*others, first, last]))
 
@@ -239,12 +240,12 @@ def _links(first: Sequence[float | None], last: Sequence[float | None]) -> dict[
 
 
 def _scale(values: Sequence[float], *, about_one: bool) -> dict[str, Any]:
-    """Range and ticks of an axis: NIS and NEES about one, others close to what there is; by decades where
-    they range over some."""
+    """Range and ticks of an axis: NIS and NEES about one, others close to the values; by decades for a wide
+    range."""
     positive = [v for v in values if v > 0.0]
     ends = [min(positive, default=1.0), max(positive, default=1.0)]
     if about_one:
-        ends = [min(ends[0], _HONEST[0]), max(ends[1], _HONEST[1])]
+        ends = [min(ends[0], _CONSISTENT[0]), max(ends[1], _CONSISTENT[1])]
     elif ends[1] <= _FAR * ends[0]:
         low, high = min(values, default=0.0), max(values, default=1.0)
         margin = 0.12 * (high - low) or 0.05 * abs(high) or 1.0
@@ -253,32 +254,32 @@ def _scale(values: Sequence[float], *, about_one: bool) -> dict[str, Any]:
     decades = range(math.floor(low) - 1, math.ceil(high) + 1)
     ticks = [c * 10.0**k for k in decades for c in ((1, 2, 5) if high - low < 2.0 else (1,))]
     inside = [tick for tick in ticks if low - 0.1 <= math.log10(tick) <= high + 0.1]
-    told = {"tickvals": inside, "ticktext": [f"{tick:g}" for tick in inside]}
-    return {"type": "log", "range": [low - 0.1, high + 0.1], **told}
+    marks = {"tickvals": inside, "ticktext": [f"{tick:g}" for tick in inside]}
+    return {"type": "log", "range": [low - 0.1, high + 0.1], **marks}
 
 
-def _honest(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
-    """One, and the band about it."""
+def _consistency_band(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
+    """A line at one, and the band of consistency about it."""
     across = {"xref": f"{x_axis} domain", "yref": y_axis, "x0": 0, "x1": 1, "layer": "below"}
     line = {"type": "line", "y0": 1, "y1": 1, "line": {"color": TRUTH, "width": 1.2}}
     fill = {"fillcolor": ESTIMATE, "opacity": 0.12, "line": {"width": 0}}
-    low, high = _HONEST
+    low, high = _CONSISTENT
     return [across | {"type": "rect", "y0": low, "y1": high, **fill}, across | line]
 
 
-def intervals(numbers: Sequence[dict[str, Any]]) -> Figure | None:
-    """Of each logarithm that has an interval, value and interval by its start; nothing where there are too
-    many to read."""
+def intervals(numbers: Sequence[FreeNumber]) -> Figure | None:
+    """Value and interval of each tuned logarithm as multiples of its start; None for too many to read."""
     shown = [
         n
         for n in numbers
-        if n["logarithm"] and n["interval"] and n["start"] and n["tuned"] and min(n["interval"]) > 0
+        if n.logarithm and n.interval and n.start and n.tuned and min(n.interval) > 0
     ]
     if not shown or len(shown) > _MOST_NUMBERS:
         return None
-    value = np.array([n["tuned"] / n["start"] for n in shown])
-    ends = np.array([n["interval"] for n in shown]) / np.array([[n["start"]] for n in shown])
-    names = [_safe(n["name"] + (f" of {n['run']}" if n["run"] else "")) for n in shown]
+    start = np.array([n.start for n in shown])
+    value = np.array([n.tuned for n in shown]) / start
+    ends = np.array([n.interval for n in shown]) / start[:, None]
+    names = [_safe(n.name + (f" of {n.run}" if n.run else "")) for n in shown]
     trace = {
         "type": "scatter",
         "x": value.tolist(),
@@ -319,12 +320,10 @@ def intervals(numbers: Sequence[dict[str, Any]]) -> Figure | None:
     layout["shapes"] = [line | {"line": {"color": TRUTH, "width": 1.2, "dash": "dash"}}]
     layout["hovermode"] = "closest"
     caption = (
-        "Tuned values and their 95 % intervals as multiples of the start (the dashed line). What the data"
-        " leave open is not shown: it stays at its start."
+        "Tuned values and their 95 % intervals as multiples of the start (the dashed line). Unobservable"
+        " parameters are not shown: they keep their initial values."
     )
-    return Figure(
-        "intervals", "How well they are known", caption, {"data": [trace], "layout": layout}
-    )
+    return Figure("intervals", "Confidence intervals", caption, {"data": [trace], "layout": layout})
 
 
 def _panels(count: int, wide: int = 1) -> dict[str, Any]:
@@ -341,15 +340,15 @@ def _panels(count: int, wide: int = 1) -> dict[str, Any]:
 
 
 def _axis_of(kind: str, number: int) -> str:
-    """What Plotly calls the axis of a trace."""
+    """Plotly's name of an axis in a trace."""
     return kind if number == 0 else f"{kind}{number + 1}"
 
 
 def _key(kind: str, number: int) -> str:
-    """What Plotly calls the same axis in a layout."""
+    """Plotly's name of the same axis in a layout."""
     return _axis_of(kind, number).replace(kind, f"{kind}axis", 1)
 
 
 def _safe(name: str) -> str:
-    """A name that Plotly, which knows some HTML, takes as it is."""
+    """A name as text for Plotly, which reads some HTML."""
     return html.escape(name, quote=False)

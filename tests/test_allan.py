@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxekf
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration import allan, static_interval
 from jaxekf.calibration.noise_densities import fit
@@ -216,12 +217,12 @@ def test_command_writes_a_start_for_tuning(tool, tmp_path):
     model = jaxekf.get_model("tight")
     noise = parameters.load(model, tmp_path / "out").noise
     np.testing.assert_allclose(noise.gyroscope, np.deg2rad(0.05), rtol=0.06)
-    np.testing.assert_allclose(noise.accelerometer, 1.85e-3 * 9.80665, rtol=0.06)
+    np.testing.assert_allclose(noise.accelerometer, 1.85e-3 * STANDARD_GRAVITY, rtol=0.06)
     np.testing.assert_allclose(noise.marker, 0.231e-3, rtol=0.06)
     table = np.genfromtxt(tmp_path / "out" / "allan.csv", delimiter=",", names=True)
     assert table.dtype.names[:3] == ("tau_s", "gyroscope_x_rad_s", "gyroscope_x_low_rad_s")
     near = np.argmin(np.abs(table["tau_s"] - 0.1))
-    expected = 1.85e-3 * 9.80665 / np.sqrt(table["tau_s"][near])
+    expected = 1.85e-3 * STANDARD_GRAVITY / np.sqrt(table["tau_s"][near])
     assert table["accelerometer_z_m_s2"][near] == pytest.approx(expected, rel=0.15)
     assert (tmp_path / "out" / "allan.png").stat().st_size > 20_000
     assert not (tmp_path / "out" / "calibration.toml").exists()

@@ -7,6 +7,7 @@ import pytest
 from scenario import LONG
 from scipy.stats import binom
 
+from jaxekf._support.constants import STANDARD_GRAVITY as GRAVITY
 from jaxekf.calibration import allan
 from jaxekf.calibration.noise_densities import fit
 from jaxekf.recordings.types import Imu
@@ -14,7 +15,6 @@ from jaxekf.recordings.types import Imu
 HERTZ, HOURS = 100.0, 2.0
 SAMPLES = int(HERTZ * HOURS * 3600.0)
 SEEDS = 50 if LONG else 6
-GRAVITY = 9.80665
 WITHIN = 0.05 if LONG else 0.1
 """Of the median of `SEEDS`: that of six scatters by 3 %, that of fifty by 1 %."""
 

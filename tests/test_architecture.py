@@ -74,7 +74,9 @@ def room_of(module):
 def test_the_house_has_these_rooms():
     """Would catch a file in the hall, and a room that no rule knows."""
     for top, rooms in ROOMS.items():
-        there = {p.name.removesuffix(".py") for p in (ROOT / top).iterdir() if p.name != "__pycache__"}
+        there = {
+            p.name.removesuffix(".py") for p in (ROOT / top).iterdir() if p.name != "__pycache__"
+        }
         assert there - {"__init__", "__main__", "py.typed"} == set(rooms)
     assert len(ROOMS["jaxekf"]) <= 14
 

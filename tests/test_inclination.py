@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import STANDARD_GRAVITY as GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.models import _earth as earth
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import NANOSECONDS, Imu, Recording, to_scipy
 from jaxekf.simulation import attitude_runs
 
-GRAVITY = 9.80665
 UP = np.array([0.0, 0.0, 1.0])
 DIP = np.deg2rad(63.0)
 FIELD = 48.0 * earth.dipping(UP, np.array([0.0, 1.0, 0.0]), DIP)

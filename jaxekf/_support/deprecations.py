@@ -1,8 +1,8 @@
-"""Old names: modules are found under them for one release, with a `DeprecationWarning`."""
+"""Old names of modules and functions: valid for one release, with a `DeprecationWarning`."""
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -162,3 +162,19 @@ def keep_old_names() -> None:
     """Find modules under their old names from now on."""
     if not any(isinstance(finder, _OldNames) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OldNames())  # pyright: ignore[reportArgumentType]
+
+
+def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """``__getattr__`` of `module` that finds its old names: `names` gives for each the present one."""
+
+    def __getattr__(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module '{module}' has no attribute '{name}'", name=name)
+        warnings.warn(
+            f"{module}.{name} is now {names[name]}; the old name will be gone in the next release",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(sys.modules[module], names[name])
+
+    return __getattr__

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.time_offset import Match
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, to_scipy
+from jaxekf.geometry.host_rotation import running_product
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, from_scipy, to_scipy
 
 Whole = NDArray[np.intp]
 
@@ -176,7 +177,8 @@ class _Turned(NamedTuple):
 def _integral(known: Floats, rate: Floats, at: Floats) -> _Turned:
     """Rates that are linear between samples, each step turned by their mean."""
     step = np.diff(known)
-    turn = _running(Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None]))
+    steps = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None])
+    turn = to_scipy(running_product(from_scipy(steps)))
     matrix = turn.as_matrix()
     slabs = 0.5 * (matrix[1:] + matrix[:-1]) * step[:, None, None]
     swept = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
@@ -186,44 +188,6 @@ def _integral(known: Floats, rate: Floats, at: Floats) -> _Turned:
     q = turn[low] * Rotation.from_rotvec((rate[low] + 0.5 * slope * since) * since)
     half = 0.5 * (matrix[low] + q.as_matrix()) * since[:, :, None]
     return _Turned(q, rate[low] + slope * since, swept[low] + half)
-
-
-def _running(turn: Rotation) -> Rotation:
-    """The identity, and the products of the first one, two, ... of N rotations: N + 1 of them.
-
-    Blocks side by side first, then each after those before it: two products for each rotation.
-    """
-    count = len(turn)
-    width = max(1, int(np.sqrt(count)))
-    blocks = -(-count // width)
-    # Components first, each contiguous: SciPy's product takes far longer to begin than to multiply.
-    q = np.zeros((4, blocks * width))
-    q[3] = 1.0
-    q[:, :count] = turn.as_quat().T
-    q = np.ascontiguousarray(q.reshape(4, blocks, width).transpose(2, 0, 1))
-    for i in range(1, width):
-        q[i] = _product(q[i - 1], q[i])
-    start = np.zeros((4, blocks))
-    start[3] = 1.0
-    for i in range(1, blocks):
-        start[:, i] = _product(start[:, i - 1], q[-1, :, i - 1])
-    whole = np.stack([_product(start, each) for each in q])
-    flat = whole.transpose(2, 0, 1).reshape(-1, 4)[:count]
-    return Rotation.from_quat(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], flat]))
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Products of quaternions (4, ...), x, y, z, w."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return np.array(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    )
 
 
 def _linear(seen: _Seen, turned: _Turned, frame: Rotation, kept: Flags) -> tuple[Floats, Floats]:

@@ -8,8 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.accounts import Indices
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, Times, period_ns
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Flags,
+    Floats,
+    Imu,
+    Optical,
+    Times,
+    period_ns,
+    to_scipy,
+)
 
 LARGEST_LAG_S = 0.5
 _FEWEST = 40
@@ -126,13 +136,7 @@ def turns(
 
 def turn_between(first: Floats, second: Floats) -> Floats:
     """Rotation vectors (N, 3), in the body, that take one attitude (N, 4) to the next."""
-    w = np.sum(first * second, axis=1)
-    v = first[:, :1] * second[:, 1:] - second[:, :1] * first[:, 1:]
-    v -= np.cross(first[:, 1:], second[:, 1:])
-    v *= np.where(w < 0.0, -1.0, 1.0)[:, None]
-    size = np.linalg.norm(v, axis=1)
-    angle = 2.0 * np.arctan2(size, np.abs(w))
-    return v * (angle / np.maximum(size, 1e-12))[:, None]
+    return (to_scipy(first).inv() * to_scipy(second)).as_rotvec()
 
 
 def strays(q: Floats) -> Flags:
@@ -155,18 +159,41 @@ def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
     begin, end = begin[few], end[few]
     # Wrong poses would outweigh all motion; where there is little of it, it is not to be cut short itself.
     sizes = np.stack([np.minimum(size[few], np.quantile(size, most)) for most in (0.9, 0.98)])
-    sizes = sizes - sizes.mean(axis=1, keepdims=True)
-    sizes /= np.maximum(np.linalg.norm(sizes, axis=1, keepdims=True), 1e-12)
     room = min(LARGEST_LAG_S, 0.1 * float(integral.t[-1]))
 
-    def likeness(lag: float) -> float:
-        other = np.linalg.norm(integral.between(begin - lag, end - lag), axis=1)
-        other = other - other.mean()
-        length = float(np.sqrt(np.sum(np.square(other))))
-        return float(np.max(sizes @ other)) / length if length > 0.0 else -np.inf
+    def gyroscope_angle(lag: float) -> Floats:
+        return np.linalg.norm(integral.between(begin - lag, end - lag), axis=1)
 
-    coarse = max(np.arange(-room, room + 0.01, 0.02), key=likeness)
-    return float(max(coarse + np.arange(-0.02, 0.021, 0.005), key=likeness))
+    coarse = best_lag(sizes, gyroscope_angle, np.arange(-room, room + 0.01, 0.02))
+    return best_lag(sizes, gyroscope_angle, coarse + np.arange(-0.02, 0.021, 0.005))
+
+
+def best_lag(signals: Floats, delayed: Callable[[float], Floats], lags: Floats) -> float:
+    """Lag at which a delayed signal correlates best with one of some signals.
+
+    Parameters
+    ----------
+    signals
+        (K, N) versions of one signal, such as one for each bound on its outliers.
+    delayed
+        Takes a lag, s, to the other signal (N,) delayed by it.
+    lags
+        (L,) lags to try, s.
+
+    Returns
+    -------
+    The lag of the largest correlation coefficient; the smallest lag where the other signal is constant.
+    """
+    signals = signals - signals.mean(axis=1, keepdims=True)
+    signals /= np.maximum(np.linalg.norm(signals, axis=1, keepdims=True), 1e-12)
+
+    def correlation(lag: float) -> float:
+        other = delayed(lag)
+        other = other - other.mean()
+        norm = float(np.sqrt(np.sum(np.square(other))))
+        return float(np.max(signals @ other)) / norm if norm > 0.0 else -np.inf
+
+    return float(max(lags, key=lambda lag: (correlation(lag), -abs(lag))))
 
 
 def fit(tracker: Floats, gyroscope: Floats) -> Fit:
@@ -180,8 +207,7 @@ def fit(tracker: Floats, gyroscope: Floats) -> Fit:
 
 
 def _fit(tracker: Floats, gyroscope: Floats) -> Fit:
-    u, _, vt = np.linalg.svd(tracker.T @ gyroscope)
-    frame = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    frame = nearest_rotation(tracker.T @ gyroscope)
     shared = float(np.sum(tracker * (gyroscope @ frame.T)))
     one, other = float(np.sum(np.square(tracker))), float(np.sum(np.square(gyroscope)))
     if shared <= 0.0:
@@ -242,7 +268,7 @@ def distance(optical: Optical, imu: Imu, lag_s: float, frame: Floats) -> Distanc
     width = 0.5 * (nodes[1] - nodes[0])
     flat = at.ravel()
     force = integral.between(flat - width, flat + width) / (2.0 * width) @ frame.T
-    force = rotate(optical.q_ref_body[rows][near.ravel()], force).reshape(*at.shape, 3)
+    force = to_scipy(optical.q_ref_body[rows][near.ravel()]).apply(force).reshape(*at.shape, 3)
     weight = _HALF_S - np.abs(nodes)
     force = np.einsum("nji,j->ni", force, weight / weight.sum())
     path = optical.position[rows]
@@ -259,7 +285,7 @@ def mean_force(made: Turns, imu: Imu, frame: Floats) -> Floats:
     integral = Integral(imu.time_ns, imu.accelerometer)
     width = 0.05
     force = integral.between(made.at - width, made.at + width) / (2.0 * width)
-    return rotate(made.begin, force @ frame.T).mean(axis=0)
+    return to_scipy(made.begin).apply(force @ frame.T).mean(axis=0)
 
 
 def _compared(swung: Floats, force: Floats) -> Distance:
@@ -274,10 +300,3 @@ def _compared(swung: Floats, force: Floats) -> Distance:
         return Distance(np.nan, 0.0, 0.0)
     size = float(np.sqrt(squares[0] / len(one)))
     return Distance(shared / squares[1], shared / np.sqrt(squares[0] * squares[1]), size)
-
-
-def rotate(q: Floats, vectors: Floats) -> Floats:
-    """Vectors (N, 3) turned by unit quaternions (N, 4) w, x, y, z."""
-    v = q[:, 1:]
-    swing = 2.0 * np.cross(v, vectors)
-    return vectors + q[:, :1] * swing + np.cross(v, swing)

@@ -12,7 +12,8 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.motion_agreement import Integral, pairs_of, turn_between
+from jaxekf.calibration.motion_agreement import Integral, best_lag, pairs_of, turn_between
+from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
 _LARGEST_S = 0.5
@@ -164,18 +165,14 @@ def _coarse(turns: _Turns, integral: CubicHermiteSpline, period_s: float) -> flo
     speed = np.linalg.norm(turns.turn, axis=1) / span
     # A wrong pose is a spike of speed, which would outweigh all motion.
     speed = np.minimum(speed, np.quantile(speed, 0.98))
-    speed = speed - speed.mean()
-    best, latency = -np.inf, 0.0
+
+    def gyroscope_speed(lag: float) -> Floats:
+        integrated = integral(turns.end - lag) - integral(turns.begin - lag)
+        return np.linalg.norm(integrated, axis=1) / span
+
     step = max(0.01, min(0.5 * period_s, 0.02))
-    for shift in np.arange(-_LARGEST_S, _LARGEST_S + step, step):
-        said = integral(turns.end - shift) - integral(turns.begin - shift)
-        other = np.linalg.norm(said, axis=1) / span
-        other = other - other.mean()
-        size = float(np.sqrt(np.sum(other**2)))
-        likeness = float(speed @ other) / size if size > 0.0 else -np.inf
-        if likeness > best:
-            best, latency = likeness, float(shift)
-    return latency
+    lags = np.arange(-_LARGEST_S, _LARGEST_S + step, step)
+    return best_lag(speed[None], gyroscope_speed, lags)
 
 
 def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Match:
@@ -183,14 +180,16 @@ def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Mat
     rate = integral.derivative()
     span = turns.end - turns.begin
     said = integral(turns.end - latency) - integral(turns.begin - latency)
-    turn = _between(said, turns.turn)
+    size = np.linalg.norm(turns.turn, axis=1)
+    weight = np.minimum(1.0, np.quantile(size, 0.98) / np.maximum(size, 1e-12))
+    turn = Rotation.from_matrix(nearest_rotation((weight[:, None] * turns.turn).T @ said))
     kept = np.ones(len(span), bool)
     design, solution, residual = np.zeros((len(span), 3, 7)), np.zeros(7), turns.turn
     design[:, :, 3:6] = -span[:, None, None] * np.eye(3)
     for _ in range(_ROUNDS):
         said = turn.apply(integral(turns.end - latency) - integral(turns.begin - latency))
         swing = rate(turns.end - latency) - rate(turns.begin - latency)
-        design[:, :, :3] = -_crossing(said)
+        design[:, :, :3] = -skew(said)
         design[:, :, 6] = -turn.apply(swing)
         flat, missed = design[kept].reshape(-1, 7), turns.turn - said
         solution = np.linalg.lstsq(flat, missed[kept].ravel(), rcond=None)[0]
@@ -209,22 +208,6 @@ def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Mat
         frame.apply(solution[3:6]),
         int(kept.sum()),
     )
-
-
-def _between(a: Floats, b: Floats) -> Rotation:
-    """The rotation that takes vectors (N, 3) nearest to others (Wahba), those of wrong poses cut short."""
-    size = np.linalg.norm(b, axis=1)
-    weight = np.minimum(1.0, np.quantile(size, 0.98) / np.maximum(size, 1e-12))
-    u, _, vt = np.linalg.svd((weight[:, None] * b).T @ a)
-    return Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
-
-
-def _crossing(vectors: Floats) -> Floats:
-    """Matrices (N, 3, 3) that multiply by a vector in a cross product, ``a x``."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def _sandwich(design: Floats, residual: Floats, kept: Flags) -> Floats:

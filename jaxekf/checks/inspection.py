@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.alignment import RunAlignment, align_run, drifts, is_late, turned_deg
 from jaxekf.checks._camera_agreement import (
@@ -21,7 +22,6 @@ GAP = 1.5
 """Median steps from which on a step is a gap."""
 _LONG_IMU_GAP_S = 0.5
 _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
-_STANDARD = 9.80665
 _SEEN_TOO_LITTLE = 0.5
 _EXPECTED = ("blank", "hidden", "missing tool", "status ")
 """What begins so is masked in good recordings, too: the tool was hidden."""
@@ -289,7 +289,7 @@ def _of_clocks(aligned: RunAlignment) -> list[str]:
 def _of_units(recording: Recording, found: Evidence) -> list[str]:
     """Numbers that no unit explains, and are not what they should be."""
     warnings = []
-    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [_STANDARD])))
+    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     at_rest = found.static_scatter < _GRAVITY_OFF
     if at_rest and abs(found.static_norm / max(gravity, 1e-9) - 1.0) > _GRAVITY_OFF:
         warnings.append(

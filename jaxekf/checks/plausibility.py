@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks.sensor_agreement import (
     ALIKE,
@@ -36,7 +37,6 @@ LEAST_RATE = np.deg2rad(2.0)
 _LEAST_ACCELERATION = 0.1
 _NEARBY, FARTHEST_M = 0.02, 20.0
 """Metres: no tracker has its tool always as near as the first, or as far as the second."""
-_STANDARD = 9.80665
 _G_WITHIN, _REMOVED_BELOW = 0.15, 0.5
 _STEADY = 0.15
 _SIZE_OFF, _TURNED = 0.5, np.deg2rad(30.0)
@@ -107,9 +107,9 @@ def _unit(ratio: float, factor: float, within: float, names: tuple[str, str]) ->
 
 def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] | None:
     """The accelerometer's unit to state instead, and the fault."""
-    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [_STANDARD])))
+    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     norm = found.static_norm
-    if not np.isfinite(norm) or not 0.5 < gravity / _STANDARD < 2.0:
+    if not np.isfinite(norm) or not 0.5 < gravity / STANDARD_GRAVITY < 2.0:
         return None
     got = f"an accelerometer that reads {norm:.3g} m/s^2 when quietest"
     expected = f"about {gravity:.3g} m/s^2"
@@ -122,7 +122,11 @@ def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] 
         hint = "recording with gravity in it, or leaving out the columns ax, ay, az"
         error = fault(recording, "imu.unit", got, f"{expected}: gravity is removed", hint)
         return "m/s^2", error
-    for unit, size in (("g", 1.0), ("m/s^2", _STANDARD**2), ("mm/s^2", 1e3 * _STANDARD)):
+    for unit, size in (
+        ("g", 1.0),
+        ("m/s^2", STANDARD_GRAVITY**2),
+        ("mm/s^2", 1e3 * STANDARD_GRAVITY),
+    ):
         if abs(norm / size - 1.0) < _G_WITHIN:
             hint = f'[imu] unit = "rad/s, {unit}"'
             return unit, fault(recording, "imu.unit", got, expected, hint)
@@ -136,7 +140,7 @@ def check_gravity(recording: Recording, found: Evidence) -> None:
     if stated is None:
         return
     size, norm = float(np.linalg.norm(stated)), found.static_norm
-    plain = found.static_scatter < _STEADY and 0.5 < norm / _STANDARD < 2.0
+    plain = found.static_scatter < _STEADY and 0.5 < norm / STANDARD_GRAVITY < 2.0
     if plain and abs(norm / max(size, 1e-12) - 1.0) > _SIZE_OFF:
         got, expected = f"free fall of {size:.3g} m/s^2", f"about {norm:.3g}, as at rest"
     elif (

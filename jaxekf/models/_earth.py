@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import GRAVITY_REF
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry import triad
 from jaxekf.pose_solvers import tilt
@@ -20,7 +21,6 @@ from jaxekf.recordings import facts
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Recording
 
-GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 1.0, 0.0)
 _FEWEST = 2
 MOST_HZ = 100.0

@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import GRAVITY_REF
+from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Output, Parameters
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.pose_solvers import marker_pose
 from jaxekf.recordings.types import Floats, Optical, Recording
-
-STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 
 
 class State(NamedTuple):
@@ -101,7 +101,7 @@ CALIBRATION = Calibration(
 )
 CALIBRATION_UNITS = Calibration("s", "m", "rad", "s/s", "1", "1")
 
-SETUP = Setup(np.array(STANDARD_GRAVITY), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+SETUP = Setup(np.array(GRAVITY_REF), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
@@ -211,6 +211,8 @@ def _object_velocity_noise(u: InputSample, params: Parameters) -> Array:
     each = linalg.diagonal(rate_noise(u, params))
     return jnp.sum(arm * arm) * jnp.max(each) * jnp.eye(3)
 
+
+__getattr__ = renamed(__name__, {"STANDARD_GRAVITY": "GRAVITY_REF"})
 
 _IN_REFERENCE = Euclidean(3, "m", frame="reference")
 _SPEED = Euclidean(3, "m/s", frame="reference")

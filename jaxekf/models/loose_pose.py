@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
@@ -137,7 +138,7 @@ def _tracked_point(recording: Recording) -> Any:
 DEFAULTS = Parameters(
     Noise(
         gyroscope=np.deg2rad(0.05),
-        accelerometer=1.85e-3 * 9.80665,
+        accelerometer=1.85e-3 * STANDARD_GRAVITY,
         bias_walk=np.deg2rad(0.002),
         accelerometer_walk=1e-3,
         position=0.5e-3,

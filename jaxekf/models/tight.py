@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import Euclidean
@@ -151,7 +152,7 @@ L_SHAPE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 DEFAULTS = Parameters(
     Noise(
         gyroscope=np.deg2rad(0.05),
-        accelerometer=1.85e-3 * 9.80665,
+        accelerometer=1.85e-3 * STANDARD_GRAVITY,
         bias_walk=np.deg2rad(0.002),
         accelerometer_walk=1e-3,
         marker=0.25e-3,

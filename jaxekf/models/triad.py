@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation, triad
@@ -149,7 +150,7 @@ MODEL = Model(
             predict_attitude,
             attitude_noise,
             attitude,
-            aux_like=Readings(np.array([0.0, 0.0, 9.80665]), np.array([0.0, 0.5, -0.866])),
+            aux_like=Readings(np.array([0.0, 0.0, STANDARD_GRAVITY]), np.array([0.0, 0.5, -0.866])),
         ),
     ),
     parameters=DEFAULTS,

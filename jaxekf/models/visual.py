@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import GRAVITY_REF
 from jaxekf.filtering.model import Model, Output, Parameters, Sensor, repeated
 from jaxekf.geometry import linalg, pinhole, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
@@ -278,7 +279,7 @@ DEFAULTS = Parameters(
         accelerometer_bias=0.2,
     ),
     Setup(
-        np.array(inertial.STANDARD_GRAVITY),
+        np.array(GRAVITY_REF),
         np.array([213.0, 213.0]),
         np.array([160.0, 120.0]),
         np.zeros(2),

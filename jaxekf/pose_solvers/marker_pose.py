@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.truth import encoder_at
 from jaxekf.recordings.types import (
     NANOSECONDS,
@@ -70,10 +71,7 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
     valid = (count >= _LEAST_MARKERS) & (spread[:, 1] > _LEAST_SPREAD * spread[:, 0])
     cross = np.einsum("nm,nmi,nmj->nij", weight, from_ref, from_body)
     cross[~valid] = np.eye(3)
-    u, _, vt = np.linalg.svd(cross)
-    sign = np.ones((len(cross), 3))
-    sign[:, 2] = np.linalg.det(u) * np.linalg.det(vt)
-    matrix = np.einsum("nij,nj,njk->nik", u, sign, vt)
+    matrix = nearest_rotation(cross)
     origin = centre_ref - np.einsum("nij,nj->ni", matrix, centre_body)
     off = from_ref - np.einsum("nij,nmj->nmi", matrix, from_body)
     error = np.sqrt(np.einsum("nm,nmi->n", weight, off**2))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.geometry.pinhole import NEAREST
 from jaxekf.recordings.types import Camera, Flags, Floats, Optical, from_scipy, to_scipy
 
@@ -272,10 +273,10 @@ def _linear(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
     matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
     if np.linalg.det(matrix[:, :3]) <= 0.0:
         return None
-    u, s, vt = np.linalg.svd(matrix[:, :3])
     # A determinant that is 0 but for rounding, as of a subset in one plane, may hide a reflection.
-    towards = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return towards.T, middle - size * towards.T @ matrix[:, 3] / s.mean()
+    towards = nearest_rotation(matrix[:, :3])
+    length = np.linalg.svd(matrix[:, :3], compute_uv=False).mean()
+    return towards.T, middle - size * towards.T @ matrix[:, 3] / length
 
 
 def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
@@ -294,8 +295,7 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     if length <= 1e-12:
         return None
     one, two = matrix[:, 0] / length, matrix[:, 1] / length
-    u, _, vt = np.linalg.svd(np.stack([one, two, np.cross(one, two)], axis=1))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = nearest_rotation(np.stack([one, two, np.cross(one, two)], axis=1))
     whole = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
     towards = turn @ whole
     return towards.T, middle - size * towards.T @ matrix[:, 2] / length
@@ -328,16 +328,8 @@ def _linearised(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Fl
     by_inside[..., 2] = -point / depth[..., None]
     slope = by_point @ by_inside
     by_place = -slope @ np.swapaxes(turn, 1, 2)[:, None]
-    by_turn = slope @ _cross(inside)
+    by_turn = slope @ skew(inside)
     return pixel - seen, np.concatenate([by_place, by_turn], axis=-1)
-
-
-def _cross(vector: Floats) -> Floats:
-    """Matrices (..., 3, 3) whose product with another vector is the cross product."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _scale(residual: Floats, usable: Flags) -> Floats:
@@ -385,7 +377,7 @@ def _of_body(
     change = np.zeros((len(away), 6, 6))
     change[:, :3, :3] = np.eye(3)
     change[:, 3:, 3:] = mount.as_matrix()
-    lever: Any = body.as_matrix() @ _cross(camera.p_body_camera)
+    lever: Any = body.as_matrix() @ skew(camera.p_body_camera)
     change[:, :3, 3:] = lever @ mount.as_matrix()
     cov = change @ cov @ np.swapaxes(change, 1, 2)
     identity = np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,8 +9,18 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, period_ns
+from jaxekf.geometry.host_rotation import running_product
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Flags,
+    Floats,
+    Imu,
+    from_scipy,
+    period_ns,
+    to_scipy,
+)
 
 _SETTLING_S = 3.0
 """Time constant of the low-pass in the frame that does not turn; accelerations of a hand average out."""
@@ -29,16 +39,7 @@ def turned(imu: Imu) -> Floats:
     """Quaternions (N, 4) that take the body at each sample to the body at the first, by gyroscope alone."""
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
-    half = 0.5 * np.linalg.norm(angle, axis=1)
-    q = np.zeros((len(imu.time_ns), 4))
-    q[0, 0] = 1.0
-    q[1:, 0] = np.cos(half)
-    q[1:, 1:] = 0.5 * angle * np.sinc(half / np.pi)[:, None]
-    # The product of all before each, in a number of passes that grows with the logarithm only.
-    reach = 1
-    while reach < len(q):
-        q[reach:] = _product(q[:-reach], q[reach:])
-        reach *= 2
+    q = running_product(from_scipy(Rotation.from_rotvec(angle)))
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
@@ -54,8 +55,8 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     assert imu.accelerometer is not None
     resting = still(imu)
     bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)
-    q = turned(replace(imu, gyroscope=imu.gyroscope - bias))
-    force = _rotate(q, imu.accelerometer)
+    q = to_scipy(turned(replace(imu, gyroscope=imu.gyroscope - bias)))
+    force = q.apply(imu.accelerometer)
     if len(force) == 1:
         return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
     rate = NANOSECONDS / max(period_ns(imu.time_ns), 1)
@@ -63,7 +64,7 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     sos = butter(2, corner, fs=rate, output="sos")
     first = force[: max(1, int(0.1 * rate))].mean(axis=0)
     smooth, _ = sosfilt(sos, force, axis=0, zi=sosfilt_zi(sos)[:, :, None] * first)
-    inside = _rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), smooth)
+    inside = q.inv().apply(smooth)
     return inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
 
 
@@ -117,14 +118,3 @@ def _trailing(values: Floats, width: int) -> Floats:
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - width, 0)
     return (total[end] - total[begin]) / (end - begin)[:, None]
-
-
-def _product(p: Floats, q: Floats) -> Floats:
-    w = p[:, 0] * q[:, 0] - np.sum(p[:, 1:] * q[:, 1:], axis=1)
-    v = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
-    return np.concatenate([w[:, None], v], axis=1)
-
-
-def _rotate(q: Floats, vectors: Floats) -> Floats:
-    swing = 2.0 * np.cross(q[:, 1:], vectors)
-    return vectors + q[:, :1] * swing + np.cross(q[:, 1:], swing)

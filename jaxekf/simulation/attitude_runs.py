@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import GRAVITY_REF
 from jaxekf.filtering.ekf import inputs_of
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.filtering.steps import Steps
@@ -53,7 +54,6 @@ class SensorGrade:
     """Noise of the field per axis, share of its norm; None for an IMU without."""
 
 
-GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 0.5, -0.5 * np.sqrt(3.0))
 """The magnetic field that a simulated IMU feels: north along y, 60 deg below the horizontal."""
 
@@ -186,9 +186,9 @@ def _optical(
     t = seconds(times)
     q, _ = motion.attitude(t)
     noise = np.deg2rad(grade.optical_deg) * rng.standard_normal((len(t), 3))
-    measured = Rotation.from_quat(np.roll(q, -1, axis=1)) * Rotation.from_rotvec(noise)
+    measured = to_scipy(q) * Rotation.from_rotvec(noise)
     blur = 1e-3 * grade.position_mm * rng.standard_normal((len(t), 3))
-    position = Rotation.from_quat(np.roll(q, -1, axis=1)).apply(marker_body) + blur
+    position = to_scipy(q).apply(marker_body) + blur
     visible = rng.uniform(size=len(t)) >= dropouts
     for begin, end in occlusions:
         visible &= (t < begin) | (t >= end)

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support import compilation
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.pose_solvers import accelerometer_array
 from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray
 from jaxekf.pose_solvers.gyro_free_rate import restored, track
@@ -39,7 +40,6 @@ _TONES = 12
 """Sinusoids in each band of each degree of freedom."""
 _BLOCK = 20_000
 """Samples that are worked on at once: each has some hundred sinusoids."""
-_G = 9.80665
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class SurgeryGrade:
     @property
     def acceleration_density(self) -> float:
         """White noise of each accelerometer, m/s^2/sqrt(Hz)."""
-        return 1e-6 * _G * self.accelerometer_ug
+        return 1e-6 * STANDARD_GRAVITY * self.accelerometer_ug
 
     @property
     def acceleration_sigma(self) -> float:

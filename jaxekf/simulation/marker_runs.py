@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxekf.models import inertial, tight
+from jaxekf._support import constants
+from jaxekf.models import tight
 from jaxekf.recordings.types import Encoder, Floats, Imu, Markers, Recording, Times, to_scipy
 from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
 
-GRAVITY_REF = np.array(inertial.STANDARD_GRAVITY)
-_G = 9.80665
+GRAVITY_REF = np.array(constants.GRAVITY_REF)
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ def tool_imu(
         force,
         rng,
         grade.imu_s,
-        1e-3 * _G * grade.accelerometer_mg,
+        1e-3 * constants.STANDARD_GRAVITY * grade.accelerometer_mg,
         grade.accelerometer_walk,
         grade.accelerometer_bias,
     )

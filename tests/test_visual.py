@@ -395,7 +395,7 @@ def test_poses_are_kept_with_their_camera():
     at the same place in memory."""
     camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
     found = pnp.poses(camera)
-    assert pnp.poses(camera) is found and pnp.solved(camera) is found
+    assert pnp.poses(camera) is found and pnp.cached_poses(camera) is found
     kept = len(pnp._KEPT)
     del camera
     assert len(pnp._KEPT) == kept - 1

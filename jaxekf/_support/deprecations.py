@@ -165,16 +165,20 @@ def keep_old_names() -> None:
 
 
 def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """``__getattr__`` of `module` that finds its old names: `names` gives for each the present one."""
+    """``__getattr__`` of `module` that finds its old names.
+
+    `names` gives for each old name the present one, or "module:name" where it left the module.
+    """
 
     def __getattr__(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module '{module}' has no attribute '{name}'", name=name)
+        home, _, new = names[name].rpartition(":")
         warnings.warn(
-            f"{module}.{name} is now {names[name]}; the old name will be gone in the next release",
+            f"{module}.{name} is now {home or module}.{new}; the old name will be gone in the next release",
             DeprecationWarning,
             stacklevel=2,
         )
-        return getattr(sys.modules[module], names[name])
+        return getattr(import_module(home or module), new)
 
     return __getattr__

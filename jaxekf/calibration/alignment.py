@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support import chi_square
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.calibration.attitude_alignment import AttitudeMatch, refine
 from jaxekf.calibration.time_offset import match
@@ -33,7 +34,7 @@ class RunAlignment(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Together(NamedTuple):
+class CombinedAlignment(NamedTuple):
     """Several runs as one: means by weight, and whether the runs agree with them."""
 
     runs: int
@@ -56,7 +57,7 @@ class Together(NamedTuple):
     """At the start of a run, by that drift; `latency_s` is that of its middle."""
 
     @property
-    def drifts(self) -> bool:
+    def has_drift(self) -> bool:
         """Whether the drift is told from nothing."""
         return abs(self.drift) > _DRIFTS * self.drift_sigma
 
@@ -88,7 +89,7 @@ def align_run(recording: Recording) -> RunAlignment:
     imu, place = recording.need_imu(), recording.path or recording.name
     tracker = align(poses(recording), imu, place)
     notes = []
-    if drifts(tracker):
+    if has_drift(tracker):
         notes.append(
             f"the tracker's clock drifts against the IMU's by {1e6 * tracker.drift:.1f} ppm,"
             f" {1e3 * tracker.drift * tracker.duration_s:.1f} ms over the run: without a"
@@ -110,12 +111,12 @@ def align(optical: Optical, imu: Imu, place: object = "recording") -> AttitudeMa
     return refine(optical, imu, match(optical, imu, place), place)
 
 
-def is_late(found: AttitudeMatch) -> bool:
+def has_latency(found: AttitudeMatch) -> bool:
     """Whether a latency is there, for certain, that matters."""
     return abs(found.latency_s) > max(_LATE_S, _SIGMAS * found.latency_sigma_s)
 
 
-def turned_deg(found: AttitudeMatch) -> tuple[float, float] | None:
+def misalignment_deg(found: AttitudeMatch) -> tuple[float, float] | None:
     """By how many degrees the frames are turned, and the largest deviation; None where they may be one."""
     angle = float(np.linalg.norm(found.alignment))
     sigma = float(np.sqrt(np.linalg.eigvalsh(found.alignment_cov)[-1]))
@@ -124,7 +125,7 @@ def turned_deg(found: AttitudeMatch) -> tuple[float, float] | None:
     return float(np.rad2deg(angle)), float(np.rad2deg(sigma))
 
 
-def drifts(found: AttitudeMatch) -> bool:
+def has_drift(found: AttitudeMatch) -> bool:
     """Whether a drift is there that one offset cannot make good."""
     return (
         abs(found.drift) > _DRIFTS * found.drift_sigma
@@ -132,7 +133,7 @@ def drifts(found: AttitudeMatch) -> bool:
     )
 
 
-def together(runs: Sequence[RunAlignment]) -> Together:
+def combine_runs(runs: Sequence[RunAlignment]) -> CombinedAlignment:
     """One latency and one alignment of all runs, each run with the weight of its covariance."""
     found = [run.tracker for run in runs]
     latency = np.array([m.latency_s for m in found])[:, None]
@@ -146,7 +147,7 @@ def together(runs: Sequence[RunAlignment]) -> Together:
     drift, drift_sigma = _mean_drift(found)
     grown = 0.0 if np.isnan(drift) else drift
     early = latency - grown * 0.5 * np.array([[m.duration_s] for m in found])
-    return Together(
+    return CombinedAlignment(
         len(found),
         float(mean[0]),
         float(np.sqrt(cov[0, 0])),
@@ -186,7 +187,7 @@ def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
     return mean, cov * max(1.0, statistic / freedom if p < _AGREE else 1.0), statistic, p
 
 
-def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[str, ...]]:
+def calibration_for(model: Model, found: CombinedAlignment) -> tuple[Parameters, tuple[str, ...]]:
     """The model's parameters with clock and frame set, and sentences on what could not be.
 
     A model's `latency` or `clock_offset` (its negative), `clock_drift` (what the IMU's clock gains on the
@@ -198,7 +199,7 @@ def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[st
     names = set(getattr(calibration, "_fields", ()))
     changes: dict[str, Any] = {}
     latency = found.latency_s
-    if "clock_drift" in names and found.drifts:
+    if "clock_drift" in names and found.has_drift:
         # It counts from the start of a run, at which the offset then holds.
         latency = found.start_latency_s
         changes["clock_drift"] = np.array(-found.drift)
@@ -227,3 +228,15 @@ def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[st
 def _with(model: Model, changes: dict[str, Any]) -> Parameters:
     params = model.parameters
     return params._replace(calibration=params.calibration._replace(**changes))
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Together": "CombinedAlignment",
+        "drifts": "has_drift",
+        "is_late": "has_latency",
+        "together": "combine_runs",
+        "turned_deg": "misalignment_deg",
+    },
+)

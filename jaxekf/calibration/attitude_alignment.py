@@ -14,15 +14,13 @@ of a filtering tracker or a noisy gyroscope are: deviations are those of cluster
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.time_offset import Match
 from jaxekf.geometry.host_rotation import running_product
+from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, from_scipy, to_scipy
-
-Whole = NDArray[np.intp]
 
 _STRETCH_S = 2.0
 _FEWEST_STRETCHES = 20
@@ -32,8 +30,8 @@ _LONGEST_IMU_GAP_S = 0.1
 _SPARE_S = 0.1
 _LEAST_STRETCHES = 10
 _ROUNDS = 12
-_OUTLYING = 5.0
-_SETTLED = 0.01
+_OUTLIER_RATIO = 5.0
+_CONVERGED = 0.01
 """Deviations within which a step ends the search."""
 _LEAST_DRIFT_S = 20.0
 _EXPLAINED, _KEPT = 0.8, 0.8
@@ -65,26 +63,26 @@ class AttitudeMatch(NamedTuple):
     duration_s: float
 
 
-class _Seen(NamedTuple):
+class _Stretches(NamedTuple):
     """Attitudes that can be compared, stretch after stretch."""
 
     t: Floats
     """(N,) seconds since the IMU's first sample, as stamped."""
     q: Rotation
     """N of them, tracked frame to reference."""
-    begin: Whole
+    begin: Indices
     """(C,) row that each stretch begins with."""
 
-    def spread(self, values: Floats) -> Floats:
+    def to_rows(self, values: Floats) -> Floats:
         """What is said of stretches (C, ...), of their rows."""
         return np.repeat(values, np.diff(self.begin, append=len(self.t)), axis=0)
 
-    def less_mean(self, values: Floats, kept: Flags) -> Floats:
+    def remove_mean(self, values: Floats, kept: Flags) -> Floats:
         """Values (N, ...) less the mean over the rows of their stretch that are kept."""
         count = np.maximum(np.add.reduceat(kept.astype(float), self.begin), 1.0)
         weight = kept.reshape(-1, *[1] * (values.ndim - 1))
         total = np.add.reduceat(values * weight, self.begin, axis=0)
-        return values - self.spread(total / count.reshape(-1, *[1] * (values.ndim - 1)))
+        return values - self.to_rows(total / count.reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording") -> AttitudeMatch:
@@ -93,28 +91,30 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
     Raises `RecordingError` where the gyroscope does not explain how the attitude turns.
     """
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
-    seen = _seen(optical, imu, start.latency_s, place)
-    middle = 0.5 * float(seen.t[0] + seen.t[-1])
-    duration = float(seen.t[-1] - seen.t[0])
+    stretches = _stretches(optical, imu, start.latency_s, place)
+    middle = 0.5 * float(stretches.t[0] + stretches.t[-1])
+    duration = float(stretches.t[-1] - stretches.t[0])
     free = slice(0, 8 if duration >= _LEAST_DRIFT_S else 7)
     frame, bias = Rotation.from_rotvec(start.alignment), start.bias
     clock = np.array([start.latency_s, 0.0])
-    kept, elapsed = np.ones(len(seen.t), bool), seen.t - middle
-    made = _Solved(np.zeros(8), np.eye(8), np.zeros((len(seen.t), 3)), 0.0)
+    kept, elapsed = np.ones(len(stretches.t), bool), stretches.t - middle
+    solution = _Solution(np.zeros(8), np.eye(8), np.zeros((len(stretches.t), 3)), 0.0)
     for _ in range(_ROUNDS):
-        at = seen.t - clock[0] - clock[1] * elapsed
-        columns, off = _linear(seen, _integral(known, imu.gyroscope - bias, at), frame, kept)
+        at = stretches.t - clock[0] - clock[1] * elapsed
+        columns, off = _linearise(
+            stretches, _integrate(known, imu.gyroscope - bias, at), frame, kept
+        )
         columns = np.concatenate([columns, columns[:, :, 6:] * elapsed[:, None, None]], axis=2)
-        columns = seen.less_mean(columns[:, :, free], kept)
-        made = _solve(seen, columns, off, kept)
-        frame = frame * Rotation.from_rotvec(made.step[:3])
-        bias = bias + made.step[3:6]
-        clock = clock + np.clip(made.step[6:], -0.05, 0.05)
-        size = np.linalg.norm(made.residual, axis=1)
-        kept = size <= _OUTLYING * max(float(np.median(size)), 1e-12)
-        if np.all(np.abs(made.step) < _SETTLED * np.sqrt(np.diagonal(made.cov))):
+        columns = stretches.remove_mean(columns[:, :, free], kept)
+        solution = _solve(stretches, columns, off, kept)
+        frame = frame * Rotation.from_rotvec(solution.step[:3])
+        bias = bias + solution.step[3:6]
+        clock = clock + np.clip(solution.step[6:], -0.05, 0.05)
+        size = np.linalg.norm(solution.residual, axis=1)
+        kept = size <= _OUTLIER_RATIO * max(float(np.median(size)), 1e-12)
+        if np.all(np.abs(solution.step) < _CONVERGED * np.sqrt(np.diagonal(solution.cov))):
             break
-    _need_likeness(seen, made.residual, kept, place)
+    _require_agreement(stretches, solution.residual, kept, place)
     if abs(clock[1]) > _LARGEST_DRIFT:
         raise RecordingError(
             str(place),
@@ -122,7 +122,7 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
             f"{1e6 * _LARGEST_DRIFT:.0f} ppm at most",
             "streams that belong together, with clocks that do not jump",
         )
-    sigma = np.sqrt(np.diagonal(made.cov))
+    sigma = np.sqrt(np.diagonal(solution.cov))
     drifting = duration >= _LEAST_DRIFT_S
     return AttitudeMatch(
         float(clock[0]),
@@ -130,15 +130,15 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
         float(clock[1]) if drifting else np.nan,
         float(sigma[7]) if drifting else np.nan,
         frame.as_rotvec(),
-        made.cov[:3, :3],
+        solution.cov[:3, :3],
         bias,
-        made.scatter,
+        solution.scatter,
         middle,
         duration,
     )
 
 
-def _seen(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Seen:
+def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Stretches:
     """Valid attitudes within the IMU's time, in stretches in which the IMU has no gap."""
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
@@ -157,64 +157,66 @@ def _seen(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Seen:
             str(place),
             f"{rows.size} attitudes in {span:.1f} s within the IMU's time",
             f"{_LEAST_STRETCHES} stretches of {length:g} s or more to match the clocks by",
-            "a longer recording, or one in which the tool is seen",
+            "a longer recording, or one in which the tool is visible",
         )
     begin = np.flatnonzero(np.diff(number, prepend=-1))
-    return _Seen(t[rows], to_scipy(optical.q_ref_body[rows]), begin)
+    return _Stretches(t[rows], to_scipy(optical.q_ref_body[rows]), begin)
 
 
-class _Turned(NamedTuple):
+class _GyroscopeIntegral(NamedTuple):
     """The gyroscope's integral at some times."""
 
     q: Rotation
     """From the IMU's frame to one that is fixed, whatever it is."""
     rate: Floats
     """(N, 3) rad/s."""
-    swept: Floats
+    q_integral: Floats
     """(N, 3, 3) s: the integral of `q` as a matrix: what a bias does."""
 
 
-def _integral(known: Floats, rate: Floats, at: Floats) -> _Turned:
-    """Rates that are linear between samples, each step turned by their mean."""
+def _integrate(known: Floats, rate: Floats, at: Floats) -> _GyroscopeIntegral:
+    """Rates that are linear between samples, each step integral by their mean."""
     step = np.diff(known)
     steps = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None])
     turn = to_scipy(running_product(from_scipy(steps)))
     matrix = turn.as_matrix()
     slabs = 0.5 * (matrix[1:] + matrix[:-1]) * step[:, None, None]
-    swept = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
+    q_integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
     low: Any = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(step) - 1)
     since = (at - known[low])[:, None]
     slope = (rate[low + 1] - rate[low]) / step[low, None]
     q = turn[low] * Rotation.from_rotvec((rate[low] + 0.5 * slope * since) * since)
     half = 0.5 * (matrix[low] + q.as_matrix()) * since[:, :, None]
-    return _Turned(q, rate[low] + slope * since, swept[low] + half)
+    return _GyroscopeIntegral(q, rate[low] + slope * since, q_integral[low] + half)
 
 
-def _linear(seen: _Seen, turned: _Turned, frame: Rotation, kept: Flags) -> tuple[Floats, Floats]:
+def _linearise(
+    stretches: _Stretches, integral: _GyroscopeIntegral, frame: Rotation, kept: Flags
+) -> tuple[Floats, Floats]:
     """How the residuals, in the reference frame, change with alignment, bias and latency (N, 3, 7), and the
     residuals (N, 3); of each stretch but for a constant."""
-    body = turned.q * frame
-    constant = _constant(seen, seen.q * body.inv(), kept)
+    body = integral.q * frame
+    constant = _mean_rotation(stretches, stretches.q * body.inv(), kept)
     expected = constant * body
-    off = expected.apply((seen.q.inv() * expected).as_rotvec())
-    of_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), turned.swept)
-    of_latency = -(constant * turned.q).apply(turned.rate)
+    off = expected.apply((stretches.q.inv() * expected).as_rotvec())
+    of_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), integral.q_integral)
+    of_latency = -(constant * integral.q).apply(integral.rate)
     columns = np.concatenate([expected.as_matrix(), of_bias, of_latency[:, :, None]], axis=2)
-    return columns, seen.less_mean(off, kept)
+    return columns, stretches.remove_mean(off, kept)
 
 
-def _constant(seen: _Seen, each: Rotation, kept: Flags) -> Rotation:
+def _mean_rotation(stretches: _Stretches, each: Rotation, kept: Flags) -> Rotation:
     """The mean over each stretch of rotations that are nearly one, for every row."""
     q = each.as_quat()
-    first = seen.spread(q[seen.begin])
+    first = stretches.to_rows(q[stretches.begin])
     q = q * np.where(np.sum(q * first, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    total = np.add.reduceat(q * kept[:, None], seen.begin, axis=0)
+    total = np.add.reduceat(q * kept[:, None], stretches.begin, axis=0)
     lost = np.linalg.norm(total, axis=1) < 1e-6
-    total[lost] = q[seen.begin][lost]
-    return Rotation.from_quat(seen.spread(total))
+    total[lost] = q[stretches.begin][lost]
+    return Rotation.from_quat(stretches.to_rows(total))
 
 
-class _Solved(NamedTuple):
+class _Solution(NamedTuple):
     step: Floats
     """(8,); a drift that is not free is 0."""
     cov: Floats
@@ -224,12 +226,12 @@ class _Solved(NamedTuple):
     scatter: float
 
 
-def _solve(seen: _Seen, columns: Floats, off: Floats, kept: Flags) -> _Solved:
+def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> _Solution:
     """Least squares with what is believed beforehand, and its covariance by clusters, a stretch each."""
     width = columns.shape[2]
     prior = 1.0 / np.square(_PRIOR[:width])
     used = columns * kept[:, None, None]
-    count = 3.0 * (kept.sum() - len(seen.begin)) - width
+    count = 3.0 * (kept.sum() - len(stretches.begin)) - width
     square, rhs = np.einsum("nij,nik->jk", used, columns), np.einsum("nij,ni->j", used, off)
 
     def solved(about: Floats) -> tuple[float, Floats, Floats]:
@@ -243,21 +245,21 @@ def _solve(seen: _Seen, columns: Floats, off: Floats, kept: Flags) -> _Solved:
     variance, inverse, step = solved(residual)
     residual = off + columns @ step
     score = np.einsum("nij,ni->nj", used, residual) / variance
-    score = np.add.reduceat(score, seen.begin, axis=0)
-    clusters = len(seen.begin)
+    score = np.add.reduceat(score, stretches.begin, axis=0)
+    clusters = len(stretches.begin)
     middle = score.T @ score * clusters / max(clusters - width, 1) + np.diag(prior)
     cov = np.diag(np.square(_PRIOR))
     cov[:width, :width] = inverse @ middle @ inverse
     whole = np.zeros(8)
     whole[:width] = step
-    return _Solved(whole, cov, residual, float(np.sqrt(variance)))
+    return _Solution(whole, cov, residual, float(np.sqrt(variance)))
 
 
-def _need_likeness(seen: _Seen, residual: Floats, kept: Flags, place: object) -> None:
+def _require_agreement(stretches: _Stretches, residual: Floats, kept: Flags, place: object) -> None:
     """The gyroscope explains most of how the attitude turns within a stretch, and in most stretches, or it
     is of another body, or of another clock half of the time."""
-    mean = _constant(seen, seen.q, kept)
-    turned = np.sum(np.square((mean.inv() * seen.q).as_rotvec()[kept]))
+    mean = _mean_rotation(stretches, stretches.q, kept)
+    rotated = np.sum(np.square((mean.inv() * stretches.q).as_rotvec()[kept]))
     left = np.sum(np.square(residual[kept]))
     if np.mean(kept) < _KEPT:
         raise RecordingError(
@@ -266,10 +268,10 @@ def _need_likeness(seen: _Seen, residual: Floats, kept: Flags, place: object) ->
             f"{100.0 * _KEPT:.0f} % or more",
             "streams that belong together, with clocks that do not jump",
         )
-    if left > (1.0 - _EXPLAINED) * turned:
+    if left > (1.0 - _EXPLAINED) * rotated:
         raise RecordingError(
             str(place),
-            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / turned):.0f} % of how the tracker"
+            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / rotated):.0f} % of how the tracker"
             " turns",
             f"{100.0 * _EXPLAINED:.0f} % or more of one body's",
             "streams that belong together, with clocks that do not jump",

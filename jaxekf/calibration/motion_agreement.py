@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.types import (
@@ -24,47 +25,47 @@ from jaxekf.recordings.types import (
 LARGEST_LAG_S = 0.5
 _FEWEST = 40
 _PAIRS = 4000
-"""Turns that are looked at, spread over the run."""
+"""RelativeRotations that are looked at, spread over the run."""
 _SEARCHED = 1500
 """Of them, those by which the lag is searched for."""
 _SPANS_S = (0.1, 0.4, 1.0)
-_PLAIN_TURN = np.deg2rad(5.0)
+_CLEAR_ROTATION = np.deg2rad(5.0)
 """A turn that is well above a tracker's noise: a slower tool is watched for longer."""
-_STRAY = 0.1
+_OUTLIER_SHARE = 0.1
 """Share of the worst turns that is left out: wrong poses."""
-_STRAY_TURN = np.deg2rad(3.0)
-_HALF_S = 0.2
+_OUTLYING_ROTATION = np.deg2rad(3.0)
+_HALF_WIDTH_S = 0.2
 _NODES = 13
 _CENTRES = 1500
 
-Reading = Callable[[Floats], Floats]
+QuaternionReading = Callable[[Floats], Floats]
 """Quaternions (N, 4) as read to those that another order or direction would give."""
 
 
-class Turns(NamedTuple):
-    """How the tracker turned, and the gyroscope meanwhile."""
+class RelativeRotations(NamedTuple):
+    """How the tracker tracked, and the gyroscope meanwhile."""
 
     tracker: Floats
     """(N, 3) rotation vectors, rad."""
     gyroscope: Floats
     """(N, 3) rad, integral of the rate at the lag found."""
-    span: Floats
+    duration_s: Floats
     """(N,) s."""
     lag_s: float
     """To be taken from the tracker's stamps."""
-    begin: Floats
+    q_begin: Floats
     """(N, 4) quaternions at which the turns begin."""
-    end: Floats
-    at: Floats
+    q_end: Floats
+    begin_s: Floats
     """(N,) seconds from the IMU's first sample at which they begin, lag taken off."""
 
 
-class Fit(NamedTuple):
+class MotionFit(NamedTuple):
     """How well the gyroscope's turns, rotated and scaled, are the tracker's."""
 
-    share: float
+    explained: float
     """Of the tracker's turning that is explained, in squares; 0 to 1."""
-    ratio: float
+    rate_ratio: float
     """Gyroscope's rate to the tracker's."""
     frame: Floats
     """(3, 3) that takes vectors of the IMU's frame into the tracked one."""
@@ -91,7 +92,7 @@ class Integral:
         )
 
 
-def pairs_of(
+def sample_pairs(
     t: Floats, span_s: float, last_s: float, most: int = _PAIRS
 ) -> tuple[Indices, Indices]:
     """Rows (N,) of times, about a span apart, within 0 and the last second with room for a lag."""
@@ -105,10 +106,10 @@ def pairs_of(
     return begin[good], end[good]
 
 
-def turns(
+def relative_rotations(
     t: Floats, attitude: Callable[[Indices], Floats], imu: Imu, most: int = _PAIRS
-) -> Turns | None:
-    """Turns between attitudes that are valid at times t (N,), seconds from the IMU's first sample.
+) -> RelativeRotations | None:
+    """RelativeRotations between attitudes that are valid at times t (N,), seconds from the IMU's first sample.
 
     `attitude` gives quaternions (n, 4) of rows. None where there are too few of them.
     """
@@ -119,33 +120,35 @@ def turns(
     for span_s in _SPANS_S:
         # Whole steps: samples 80 ms apart are 160 ms apart next, no longer about 100 ms.
         whole = step * max(1.0, np.ceil(span_s / step - 1e-3))
-        begin, end = pairs_of(t, whole, last, most)
+        begin, end = sample_pairs(t, whole, last, most)
         if len(begin) < _FEWEST:
             return None
         rows, where = np.unique(np.concatenate([begin, end]), return_inverse=True)
         q = attitude(rows)[where]
         first, second = q[: len(begin)], q[len(begin) :]
-        turned = turn_between(first, second)
-        size = np.linalg.norm(turned, axis=1)
-        if span_s == _SPANS_S[-1] or np.quantile(size, 0.9) > _PLAIN_TURN:
+        tracked = rotation_vectors(first, second)
+        size = np.linalg.norm(tracked, axis=1)
+        if span_s == _SPANS_S[-1] or np.quantile(size, 0.9) > _CLEAR_ROTATION:
             lag = _lag(t[begin], t[end], size, integral)
-            said = integral.between(t[begin] - lag, t[end] - lag)
-            return Turns(turned, said, t[end] - t[begin], lag, first, second, t[begin] - lag)
+            integrated = integral.between(t[begin] - lag, t[end] - lag)
+            return RelativeRotations(
+                tracked, integrated, t[end] - t[begin], lag, first, second, t[begin] - lag
+            )
     return None
 
 
-def turn_between(first: Floats, second: Floats) -> Floats:
+def rotation_vectors(first: Floats, second: Floats) -> Floats:
     """Rotation vectors (N, 3), in the body, that take one attitude (N, 4) to the next."""
     return (to_scipy(first).inv() * to_scipy(second)).as_rotvec()
 
 
-def strays(q: Floats) -> Flags:
+def outlying_poses(q: Floats) -> Flags:
     """Which attitudes (N, 4) are of another pose than those before and after, which are alike."""
     found = np.zeros(len(q), bool)
     if len(q) > 2:
         step = _angle(q[1:], q[:-1])
         over = _angle(q[2:], q[:-2])
-        found[1:-1] = np.minimum(step[1:], step[:-1]) > _STRAY_TURN + 3.0 * over
+        found[1:-1] = np.minimum(step[1:], step[:-1]) > _OUTLYING_ROTATION + 3.0 * over
     return found
 
 
@@ -196,50 +199,56 @@ def best_lag(signals: Floats, delayed: Callable[[float], Floats], lags: Floats) 
     return float(max(lags, key=lambda lag: (correlation(lag), -abs(lag))))
 
 
-def fit(tracker: Floats, gyroscope: Floats) -> Fit:
-    """Rotation (Wahba) and ratio from the gyroscope's turns (N, 3) to the tracker's, strays left out."""
+def fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
+    """Rotation (Wahba) and ratio from the gyroscope's turns (N, 3) to the tracker's, outlying_poses left out."""
     size = np.linalg.norm(tracker, axis=1)
     weight = np.minimum(1.0, np.quantile(size, 0.95) / np.maximum(size, 1e-12))
-    found = _fit(tracker * weight[:, None], gyroscope * weight[:, None])
-    off = np.linalg.norm(tracker - gyroscope @ found.frame.T / found.ratio, axis=1)
-    kept = off <= np.quantile(off, 1.0 - _STRAY)
-    return _fit(tracker[kept], gyroscope[kept])
+    found = _motion_fit(tracker * weight[:, None], gyroscope * weight[:, None])
+    off = np.linalg.norm(tracker - gyroscope @ found.frame.T / found.rate_ratio, axis=1)
+    kept = off <= np.quantile(off, 1.0 - _OUTLIER_SHARE)
+    return _motion_fit(tracker[kept], gyroscope[kept])
 
 
-def _fit(tracker: Floats, gyroscope: Floats) -> Fit:
+def _motion_fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
     frame = nearest_rotation(tracker.T @ gyroscope)
     shared = float(np.sum(tracker * (gyroscope @ frame.T)))
     one, other = float(np.sum(np.square(tracker))), float(np.sum(np.square(gyroscope)))
     if shared <= 0.0:
-        return Fit(0.0, np.inf, frame)
-    return Fit(shared**2 / (one * other), other / shared, frame)
+        return MotionFit(0.0, np.inf, frame)
+    return MotionFit(shared**2 / (one * other), other / shared, frame)
 
 
-def readings(made: Turns, others: Mapping[str, Reading]) -> dict[str, Fit]:
+def fit_readings(
+    rotations: RelativeRotations, others: Mapping[str, QuaternionReading]
+) -> dict[str, MotionFit]:
     """The fit that each other reading of the quaternions would give."""
     return {
-        name: fit(turn_between(read(made.begin), read(made.end)), made.gyroscope)
+        name: fit(
+            rotation_vectors(read(rotations.q_begin), read(rotations.q_end)), rotations.gyroscope
+        )
         for name, read in others.items()
     }
 
 
-def second_axis(vectors: Floats) -> float:
+def second_axis_share(vectors: Floats) -> float:
     """How much there is about a second axis beside the first, in squares, 0 to 1."""
     values = np.linalg.eigvalsh(vectors.T @ vectors)
     return float(values[1] / values[2]) if values[2] > 0.0 else 0.0
 
 
-class Distance(NamedTuple):
+class AccelerationFit(NamedTuple):
     """How a tracker's path and the accelerometer's agree."""
 
-    ratio: float
+    rate_ratio: float
     """Of the tracker's acceleration to the accelerometer's."""
     correlation: float
     acceleration: float
     """Root mean square of the tracker's, in its unit / s^2."""
 
 
-def distance(optical: Optical, imu: Imu, lag_s: float, frame: Floats) -> Distance | None:
+def acceleration_fit(
+    optical: Optical, imu: Imu, lag_s: float, frame: Floats
+) -> AccelerationFit | None:
     """The tracker's second differences over 0.2 s against the accelerometer's double integral.
 
     ``p(t + T) - 2 p(t) + p(t - T)`` is the integral of ``(T - |s|) a(t + s)``; gravity, which is constant,
@@ -254,9 +263,9 @@ def distance(optical: Optical, imu: Imu, lag_s: float, frame: Floats) -> Distanc
         return None
     t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS - lag_s
     integral = Integral(imu.time_ns, imu.accelerometer)
-    inside = (t >= _HALF_S + 0.05) & (t <= integral.t[-1] - _HALF_S - 0.05)
+    inside = (t >= _HALF_WIDTH_S + 0.05) & (t <= integral.t[-1] - _HALF_WIDTH_S - 0.05)
     centre = t[inside][:: max(1, -(-int(inside.sum()) // _CENTRES))]
-    nodes = np.linspace(-_HALF_S, _HALF_S, _NODES)
+    nodes = np.linspace(-_HALF_WIDTH_S, _HALF_WIDTH_S, _NODES)
     at = centre[:, None] + nodes
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     near = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
@@ -269,34 +278,52 @@ def distance(optical: Optical, imu: Imu, lag_s: float, frame: Floats) -> Distanc
     flat = at.ravel()
     force = integral.between(flat - width, flat + width) / (2.0 * width) @ frame.T
     force = to_scipy(optical.q_ref_body[rows][near.ravel()]).apply(force).reshape(*at.shape, 3)
-    weight = _HALF_S - np.abs(nodes)
+    weight = _HALF_WIDTH_S - np.abs(nodes)
     force = np.einsum("nji,j->ni", force, weight / weight.sum())
     path = optical.position[rows]
     where = np.stack([np.interp(at[:, [0, _NODES // 2, -1]], t, path[:, i]) for i in range(3)], 2)
-    swung = (where[:, 2] - 2.0 * where[:, 1] + where[:, 0]) / _HALF_S**2
-    return _compared(swung, force)
+    acceleration = (where[:, 2] - 2.0 * where[:, 1] + where[:, 0]) / _HALF_WIDTH_S**2
+    return _fit_accelerations(acceleration, force)
 
 
-def mean_force(made: Turns, imu: Imu, frame: Floats) -> Floats:
+def mean_force(rotations: RelativeRotations, imu: Imu, frame: Floats) -> Floats:
     """Mean of the accelerometer's readings (3,) in the reference frame, m/s^2: opposite to free fall,
     whatever the motion. NaN without an accelerometer."""
     if imu.accelerometer is None:
         return np.full(3, np.nan)
     integral = Integral(imu.time_ns, imu.accelerometer)
     width = 0.05
-    force = integral.between(made.at - width, made.at + width) / (2.0 * width)
-    return to_scipy(made.begin).apply(force @ frame.T).mean(axis=0)
+    force = integral.between(rotations.begin_s - width, rotations.begin_s + width) / (2.0 * width)
+    return to_scipy(rotations.q_begin).apply(force @ frame.T).mean(axis=0)
 
 
-def _compared(swung: Floats, force: Floats) -> Distance:
-    one, other = swung - np.median(swung, axis=0), force - np.median(force, axis=0)
+def _fit_accelerations(acceleration: Floats, force: Floats) -> AccelerationFit:
+    one, other = acceleration - np.median(acceleration, axis=0), force - np.median(force, axis=0)
     # Wrong poses leave huge differences.
     size = np.linalg.norm(one, axis=1)
-    kept = size <= np.quantile(size, 1.0 - _STRAY)
+    kept = size <= np.quantile(size, 1.0 - _OUTLIER_SHARE)
     one, other = one[kept] - one[kept].mean(axis=0), other[kept] - other[kept].mean(axis=0)
     shared = float(np.sum(one * other))
     squares = float(np.sum(one**2)), float(np.sum(other**2))
     if min(squares) <= 0.0:
-        return Distance(np.nan, 0.0, 0.0)
+        return AccelerationFit(np.nan, 0.0, 0.0)
     size = float(np.sqrt(squares[0] / len(one)))
-    return Distance(shared / squares[1], shared / np.sqrt(squares[0] * squares[1]), size)
+    return AccelerationFit(shared / squares[1], shared / np.sqrt(squares[0] * squares[1]), size)
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Distance": "AccelerationFit",
+        "Fit": "MotionFit",
+        "Reading": "QuaternionReading",
+        "Turns": "RelativeRotations",
+        "distance": "acceleration_fit",
+        "pairs_of": "sample_pairs",
+        "readings": "fit_readings",
+        "second_axis": "second_axis_share",
+        "strays": "outlying_poses",
+        "turn_between": "rotation_vectors",
+        "turns": "relative_rotations",
+    },
+)

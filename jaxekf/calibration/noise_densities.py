@@ -19,6 +19,7 @@ from scipy.fft import dst
 from scipy.optimize import brentq, nnls
 
 from jaxekf._support import chi_square
+from jaxekf._support.deprecations import renamed
 from jaxekf.recordings.types import Flags, Floats
 
 TERMS = ("quantisation", "white", "flicker", "walk")
@@ -36,7 +37,7 @@ _OCTAVES_JUDGED, _OCTAVES_DROPPED = 7, 6
 _LEAST_LINES = 100
 
 
-class Estimated(NamedTuple):
+class Coefficient(NamedTuple):
     """A coefficient with its 95 % interval; `low` is 0 where the data do not tell it from nothing."""
 
     value: float
@@ -44,7 +45,7 @@ class Estimated(NamedTuple):
     high: float
 
     @property
-    def found(self) -> bool:
+    def significant(self) -> bool:
         """Whether it is told from nothing."""
         return self.low > 0.0
 
@@ -54,13 +55,13 @@ class Densities(NamedTuple):
 
     quantisation: float
     """Q, u s."""
-    white: Estimated
+    white: Coefficient
     """N, u/sqrt(Hz)."""
     flicker: float
     """B, u; 0 where nothing speaks for it."""
-    walk: Estimated
+    walk: Coefficient
     """K, u/s/sqrt(Hz)."""
-    walk_alone: Estimated
+    walk_alone: Coefficient
     """K, u/s/sqrt(Hz), where a walk has to stand for flicker too, as in a filter that knows no flicker."""
     band_hz: float
     """Up to this frequency the noise is of this kind, and was used."""
@@ -110,7 +111,7 @@ def fit(values: Floats, period_s: float) -> Densities:
     """
     step = np.diff(np.asarray(values, float))
     if not step.any():
-        nothing = Estimated(0.0, 0.0, 0.0)
+        nothing = Coefficient(0.0, 0.0, 0.0)
         return Densities(0.0, nothing, 0.0, nothing, nothing, 0.5 / period_s)
     lines = _of_the_four_kinds(_lines(step, period_s))
     terms, found = (_WHITE, _WALK), _maximise(lines, (_WHITE, _WALK))
@@ -227,7 +228,7 @@ def _maximise(
 
 def _interval(
     lines: _Lines, terms: tuple[int, ...], found: Floats, term: int, spread: float
-) -> Estimated:
+) -> Coefficient:
     """The coefficients that the likelihood does not refuse, all others at their best."""
     best = _cost(lines, found)
 
@@ -240,7 +241,7 @@ def _interval(
     low = 0.0
     if found[term] > 0.0 and excess(0.0) > 0.0:
         low = _crossing(excess, float(found[term]), 0.5)
-    return Estimated(*(float(np.sqrt(value)) for value in (found[term], low, high)))
+    return Coefficient(*(float(np.sqrt(value)) for value in (found[term], low, high)))
 
 
 def _crossing(excess: Callable[[float], float], begin: float, factor: float) -> float:
@@ -273,3 +274,11 @@ def _misfit(lines: _Lines, variance: Floats) -> float:
     if np.all(off <= np.maximum(_MISFIT, _MISFIT_SIGMAS * np.sqrt(2.0 / held))):
         return 0.0
     return float(off.mean())
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Estimated": "Coefficient",
+    },
+)

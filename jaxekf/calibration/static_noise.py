@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration import static_interval
 from jaxekf.calibration.allan import Curve, ImuNoise, SensorNoise, imu_noise
-from jaxekf.calibration.noise_densities import Estimated
+from jaxekf.calibration.noise_densities import Coefficient
 from jaxekf.calibration.static_interval import TrackerNoise
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import NANOSECONDS, Floats, Recording
@@ -37,7 +38,7 @@ class StaticNoise(NamedTuple):
         return found
 
 
-class Start(NamedTuple):
+class NoiseStart(NamedTuple):
     """Parameters to tune from."""
 
     params: Parameters
@@ -77,7 +78,7 @@ def static_noise(
     )
 
 
-def start_for(model: Model, found: StaticNoise) -> Start:
+def start_for(model: Model, found: StaticNoise) -> NoiseStart:
     """The model's defaults with the noise that was found, axis by axis.
 
     A bias walk that the rest is too short to tell keeps its default, or the upper end of its interval
@@ -117,7 +118,7 @@ def start_for(model: Model, found: StaticNoise) -> Start:
                 " to the next: they are filtered or drift, and what a filter needs lies between"
             )
     params = model.parameters._replace(noise=noise._replace(**changes))
-    return Start(params, tuple(changes), tuple(sentences))
+    return NoiseStart(params, tuple(changes), tuple(sentences))
 
 
 def _known(found: StaticNoise) -> dict[str, tuple[Floats, str]]:
@@ -142,21 +143,21 @@ def _walk(
 ) -> tuple[Floats | None, list[str]]:
     """The walk of each axis where it was found, and a sentence on those where it was not."""
     walks = [axis.walk_alone for axis in sensor.axes]
-    told = np.array([walk.found for walk in walks])
-    if told.all():
+    significant = np.array([walk.significant for walk in walks])
+    if significant.all():
         return np.array([walk.value for walk in walks]), []
     high = np.array([walk.high for walk in walks])
     usual = np.broadcast_to(default if default.ndim < 2 else np.diagonal(default), (3,))
-    value = np.where(told, [walk.value for walk in walks], np.minimum(usual, high))
+    value = np.where(significant, [walk.value for walk in walks], np.minimum(usual, high))
     limits = ", ".join(
-        f"{shown(high[i], sensor.unit, '/s/√Hz')} ({AXES[i]})" for i in np.flatnonzero(~told)
+        f"{shown(high[i], sensor.unit, '/s/√Hz')} ({AXES[i]})" for i in np.flatnonzero(~significant)
     )
     kept = "the default is kept" if np.all(usual <= high) else "no more is taken"
     sentence = (
         f"{name}: {found.imu.duration_s:.0f} s do not tell a random walk of the bias, only that it is below"
         f" {limits}; {kept}"
     )
-    unchanged = not told.any() and bool(np.all(usual <= high))
+    unchanged = not significant.any() and bool(np.all(usual <= high))
     return (None if unchanged or not np.all(value > 0.0) else value), [sentence]
 
 
@@ -220,8 +221,8 @@ def as_dict(found: StaticNoise) -> dict[str, Any]:
     return document
 
 
-def _interval(estimated: Estimated) -> dict[str, Any]:
-    return estimated._asdict() | {"found": estimated.found}
+def _interval(estimated: Coefficient) -> dict[str, Any]:
+    return estimated._asdict() | {"found": estimated.significant}
 
 
 def write_curve(path: Path, found: StaticNoise) -> None:
@@ -229,3 +230,11 @@ def write_curve(path: Path, found: StaticNoise) -> None:
     columns, values = curve_table(found)
     rows: Sequence[str] = [",".join(f"{value:.9g}" for value in row) for row in values]
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Start": "NoiseStart",
+    },
+)

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.motion_agreement import Integral, best_lag, pairs_of, turn_between
+from jaxekf.calibration.motion_agreement import Integral, best_lag, rotation_vectors, sample_pairs
 from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
@@ -22,15 +22,15 @@ _LONGEST_GAP = 2.5
 _FEWEST = 50
 _COARSE = 6000
 """Turns among which the latency is searched for."""
-_OUTLYING = 5.0
+_OUTLIER_RATIO = 5.0
 _ROUNDS = 12
 _CORRELATED = 8
 """Samples over which residuals are taken to be correlated."""
 _LARGEST_SIGMA_S = 0.005
 _BLOCK_S, _LOCAL = 0.2, 20
 """Seconds over which rates are compared, and blocks whose mean is taken off."""
-_SURE = 1.0 - 1e-9
-_BY_CHANCE = 8.0
+_LARGEST_CORRELATION = 1.0 - 1e-9
+_SIGNIFICANT = 8.0
 """Deviations that a correlation of noise does not reach, with lag and frame fitted to it."""
 
 
@@ -53,7 +53,7 @@ class Match:
     """Turns from sample to sample that were used; outliers are not."""
 
 
-class _Turns(NamedTuple):
+class _Rotations(NamedTuple):
     """Turns of the tracker from sample to sample."""
 
     begin: Floats
@@ -69,20 +69,20 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
     Raises `RecordingError` where there are too few turns, so little motion that the latency is not known to
     5 ms, or where it would be half a second or more: it is then refused, not guessed.
     """
-    turns = _turns(optical, imu)
+    turns = _relative_rotations(optical, imu)
     if len(turns.turn) < _FEWEST:
         raise RecordingError(
             str(place),
             f"{len(turns.turn)} pairs of tracker samples within the IMU's time",
             f"{_FEWEST} or more to match the clocks by",
-            "a longer recording, or one in which the tool is seen",
+            "a longer recording, or one in which the tool is rows",
         )
     seconds = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     steps = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * np.diff(seconds)[:, None]
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     integral = CubicHermiteSpline(seconds, angle, imu.gyroscope)
-    latency = _coarse(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
-    found = _refined(turns, integral, latency)
+    latency = _coarse_latency(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
+    found = _gauss_newton(turns, integral, latency)
     if abs(found.latency_s) >= _LARGEST_S:
         raise RecordingError(
             str(place),
@@ -97,47 +97,49 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
             f"{1e3 * _LARGEST_SIGMA_S:.0f} ms or better",
             "a recording in which the tool turns about several axes, faster and slower",
         )
-    _need_changes(optical, imu, found, place)
+    _require_rate_changes(optical, imu, found, place)
     return found
 
 
-def _need_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
+def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
     """Both streams tell the same changes of rate, or the latency is that of noise.
 
     Where the rate is constant, its changes are the gyroscope's noise, in which some lag always fits best,
     and as sharply as if they were motion. Only what the tracker shares is.
     """
-    seen = np.flatnonzero(optical.valid)
-    t = (optical.time_ns[seen] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
+    rows = np.flatnonzero(optical.valid)
+    t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     integral = Integral(imu.time_ns, imu.gyroscope)
     period = period_ns(optical.time_ns) / NANOSECONDS
     span = max(_BLOCK_S, period)
     last = float(integral.t[-1])
-    begin, end = pairs_of(t, span, last, max(1, int((t[-1] - t[0]) / span)))
-    q = optical.q_ref_body[seen]
-    lasts = (t[end] - t[begin])[:, None]
-    turned = turn_between(q[begin], q[end]) / lasts
-    said = integral.between(t[begin] - found.latency_s, t[end] - found.latency_s) / lasts
-    said = Rotation.from_rotvec(found.alignment).inv().apply(said)
-    size = np.linalg.norm(turned, axis=1)
-    kept = size <= _OUTLYING * max(float(np.quantile(size, 0.9)), 1e-12)
-    one, other = (_less_local_mean(rates[kept]) for rates in (turned, said))
+    begin, end = sample_pairs(t, span, last, max(1, int((t[-1] - t[0]) / span)))
+    q = optical.q_ref_body[rows]
+    durations = (t[end] - t[begin])[:, None]
+    tracked = rotation_vectors(q[begin], q[end]) / durations
+    integrated = integral.between(t[begin] - found.latency_s, t[end] - found.latency_s) / durations
+    integrated = Rotation.from_rotvec(found.alignment).inv().apply(integrated)
+    size = np.linalg.norm(tracked, axis=1)
+    kept = size <= _OUTLIER_RATIO * max(float(np.quantile(size, 0.9)), 1e-12)
+    one, other = (_remove_local_mean(rates[kept]) for rates in (tracked, integrated))
     shared = float(np.sum(one * other))
     squares = float(np.sum(one**2) * np.sum(other**2))
-    likeness = shared / np.sqrt(squares) if squares > 0.0 else 0.0
+    correlation = shared / np.sqrt(squares) if squares > 0.0 else 0.0
     # Fisher's transform: of few blocks, too, a correlation near one is none of chance.
-    deviations = np.arctanh(np.clip(likeness, -_SURE, _SURE)) * np.sqrt(max(one.size - 3, 1))
-    if deviations < _BY_CHANCE:
+    deviations = np.arctanh(
+        np.clip(correlation, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
+    ) * np.sqrt(max(one.size - 3, 1))
+    if deviations < _SIGNIFICANT:
         raise RecordingError(
             str(place),
             "so little turning faster and slower that tracker and gyroscope are alike by chance only"
-            f" (correlation {likeness:.2f})",
-            f"{np.tanh(_BY_CHANCE / np.sqrt(max(one.size - 3, 1))):.2f} or more",
+            f" (correlation {correlation:.2f})",
+            f"{np.tanh(_SIGNIFICANT / np.sqrt(max(one.size - 3, 1))):.2f} or more",
             "a recording in which the tool turns about several axes, faster and slower",
         )
 
 
-def _less_local_mean(rates: Floats) -> Floats:
+def _remove_local_mean(rates: Floats) -> Floats:
     """Rates (N, 3) less the mean of those about them: no constant turning, no wandering bias."""
     groups = np.arange(len(rates)) // _LOCAL
     count = np.bincount(groups)[:, None]
@@ -145,22 +147,22 @@ def _less_local_mean(rates: Floats) -> Floats:
     return rates - (total / count)[groups]
 
 
-def _turns(optical: Optical, imu: Imu) -> _Turns:
-    seen = np.flatnonzero(optical.valid)
-    times = (optical.time_ns - optical.latency_ns - imu.time_ns[0])[seen] / NANOSECONDS
-    attitude = to_scipy(optical.q_ref_body[seen])
+def _relative_rotations(optical: Optical, imu: Imu) -> _Rotations:
+    rows = np.flatnonzero(optical.valid)
+    times = (optical.time_ns - optical.latency_ns - imu.time_ns[0])[rows] / NANOSECONDS
+    attitude = to_scipy(optical.q_ref_body[rows])
     turn = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
     span = np.diff(times)
     last = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
     kept = span <= _LONGEST_GAP * period_ns(optical.time_ns) / NANOSECONDS
     kept &= (times[:-1] >= _LARGEST_S) & (times[1:] <= last - _LARGEST_S)
-    return _Turns(times[:-1][kept], times[1:][kept], turn[kept])
+    return _Rotations(times[:-1][kept], times[1:][kept], turn[kept])
 
 
-def _coarse(turns: _Turns, integral: CubicHermiteSpline, period_s: float) -> float:
+def _coarse_latency(turns: _Rotations, integral: CubicHermiteSpline, period_s: float) -> float:
     """The latency at which both turn alike fast, whatever their frames: the best correlation."""
     # Of a long run some are enough to tell so roughly.
-    turns = _Turns(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
+    turns = _Rotations(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
     span = turns.end - turns.begin
     speed = np.linalg.norm(turns.turn, axis=1) / span
     # A wrong pose is a spike of speed, which would outweigh all motion.
@@ -175,30 +177,30 @@ def _coarse(turns: _Turns, integral: CubicHermiteSpline, period_s: float) -> flo
     return best_lag(speed[None], gyroscope_speed, lags)
 
 
-def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Match:
+def _gauss_newton(turns: _Rotations, integral: CubicHermiteSpline, latency: float) -> Match:
     """Latency, alignment and bias together by Gauss and Newton, wrong turns left out."""
     rate = integral.derivative()
     span = turns.end - turns.begin
-    said = integral(turns.end - latency) - integral(turns.begin - latency)
+    integrated = integral(turns.end - latency) - integral(turns.begin - latency)
     size = np.linalg.norm(turns.turn, axis=1)
     weight = np.minimum(1.0, np.quantile(size, 0.98) / np.maximum(size, 1e-12))
-    turn = Rotation.from_matrix(nearest_rotation((weight[:, None] * turns.turn).T @ said))
+    turn = Rotation.from_matrix(nearest_rotation((weight[:, None] * turns.turn).T @ integrated))
     kept = np.ones(len(span), bool)
     design, solution, residual = np.zeros((len(span), 3, 7)), np.zeros(7), turns.turn
     design[:, :, 3:6] = -span[:, None, None] * np.eye(3)
     for _ in range(_ROUNDS):
-        said = turn.apply(integral(turns.end - latency) - integral(turns.begin - latency))
-        swing = rate(turns.end - latency) - rate(turns.begin - latency)
-        design[:, :, :3] = -skew(said)
-        design[:, :, 6] = -turn.apply(swing)
-        flat, missed = design[kept].reshape(-1, 7), turns.turn - said
+        integrated = turn.apply(integral(turns.end - latency) - integral(turns.begin - latency))
+        rate_change = rate(turns.end - latency) - rate(turns.begin - latency)
+        design[:, :, :3] = -skew(integrated)
+        design[:, :, 6] = -turn.apply(rate_change)
+        flat, missed = design[kept].reshape(-1, 7), turns.turn - integrated
         solution = np.linalg.lstsq(flat, missed[kept].ravel(), rcond=None)[0]
         residual = missed - np.einsum("nij,j->ni", design, solution)
         turn = Rotation.from_rotvec(solution[:3]) * turn
         latency = float(np.clip(latency + np.clip(solution[6], -0.02, 0.02), -1.0, 1.0))
         size = np.linalg.norm(residual, axis=1)
-        kept = size <= _OUTLYING * max(float(np.median(size)), 1e-12)
-    sigma = np.sqrt(np.diagonal(_sandwich(design, residual, kept)))
+        kept = size <= _OUTLIER_RATIO * max(float(np.median(size)), 1e-12)
+    sigma = np.sqrt(np.diagonal(_robust_covariance(design, residual, kept)))
     frame = turn.inv()
     return Match(
         latency,
@@ -210,7 +212,7 @@ def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Mat
     )
 
 
-def _sandwich(design: Floats, residual: Floats, kept: Flags) -> Floats:
+def _robust_covariance(design: Floats, residual: Floats, kept: Flags) -> Floats:
     """Covariance of a least-squares solution whose residuals are correlated over a few samples.
 
     The noise of a sample is in the turn to it and the turn from it, so that most of it cancels.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.alignment import align, is_late, turned_deg
+from jaxekf.calibration.alignment import align, has_latency, misalignment_deg
 from jaxekf.calibration.attitude_alignment import AttitudeMatch
 from jaxekf.checks.plausibility import (
     FARTHEST_M,
@@ -116,7 +116,7 @@ def check_camera(recording: Recording, found: CameraEvidence) -> None:
     """Raise `RecordingError` where images or IMU plainly contradict what is said of the camera: no pose
     fits any image, or lengths or the gyroscope are in another unit."""
     if found.posed == 0:
-        raise pnp.no_pose(recording.path or recording.name, found.images)
+        raise pnp.no_pose_error(recording.path or recording.name, found.images)
     imu = found.imu
     unit = rates_unit(imu)
     if unit is not None:
@@ -181,12 +181,12 @@ def camera_warnings(found: CameraEvidence) -> list[str]:
 
 def _of_match(made: AttitudeMatch) -> list[str]:
     warnings = []
-    if is_late(made):
+    if has_latency(made):
         warnings.append(
             f"the images are {1e3 * made.latency_s:.1f} ± {1e3 * made.latency_sigma_s:.1f} ms older than"
             " stamped, by the IMU's clock: state [camera] latency, or tune calibration.latency"
         )
-    if (turned := turned_deg(made)) is not None:
+    if (turned := misalignment_deg(made)) is not None:
         warnings.append(
             f"the camera is turned by {turned[0]:.1f} ± {turned[1]:.1f} deg against where"
             " q_body_camera says: correct it, or tune calibration.alignment"

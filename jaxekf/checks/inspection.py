@@ -6,8 +6,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.constants import STANDARD_GRAVITY
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.alignment import RunAlignment, align_run, drifts, is_late, turned_deg
+from jaxekf.calibration.alignment import (
+    RunAlignment,
+    align_run,
+    has_drift,
+    has_latency,
+    misalignment_deg,
+)
 from jaxekf.checks._camera_agreement import (
     CameraEvidence,
     camera_evidence,
@@ -45,7 +52,7 @@ class Gaps:
         return {"count": self.count, "longest_s": self.longest_s, "lost_s": self.lost_s}
 
 
-class StreamFound(NamedTuple):
+class StreamSummary(NamedTuple):
     """One stream, or one marker of a tool."""
 
     samples: int
@@ -69,7 +76,7 @@ class StreamFound(NamedTuple):
         return document | {"duration_s": self.end_s - self.begin_s}
 
 
-class PointsFound(NamedTuple):
+class PointsSummary(NamedTuple):
     """Landmarks in the images of a camera."""
 
     landmarks: int
@@ -84,7 +91,7 @@ class Inspection:
     """What was found of one run."""
 
     run: str
-    streams: dict[str, StreamFound]
+    streams: dict[str, StreamSummary]
     evidence: Evidence
     alignment: RunAlignment | None
     """None where the run does not tell it, or has nothing to align."""
@@ -94,9 +101,9 @@ class Inspection:
     """What should be looked at before."""
     notes: tuple[str, ...] = ()
     """What is as it is in good runs, too."""
-    markers: dict[str, StreamFound] = field(default_factory=dict)
+    markers: dict[str, StreamSummary] = field(default_factory=dict)
     """Single markers by their names."""
-    points: PointsFound | None = None
+    points: PointsSummary | None = None
     """None without a camera."""
     camera: CameraEvidence | None = None
     """None also where no image has landmarks enough for a pose."""
@@ -155,7 +162,7 @@ def inspect(recording: Recording) -> Inspection:
     )
 
 
-def _stream(recording: Recording, label: str) -> StreamFound:
+def _stream(recording: Recording, label: str) -> StreamSummary:
     stream: Any = getattr(recording, label)
     usable = np.ones(len(stream.time_ns), bool)
     if label in ("optical", "encoder"):
@@ -172,7 +179,7 @@ def _stream(recording: Recording, label: str) -> StreamFound:
     return _found(stream.time_ns - getattr(stream, "latency_ns", 0), usable, masked, dropped)
 
 
-def _markers(recording: Recording) -> dict[str, StreamFound]:
+def _markers(recording: Recording) -> dict[str, StreamSummary]:
     markers = recording.markers
     if markers is None:
         return {}
@@ -183,12 +190,14 @@ def _markers(recording: Recording) -> dict[str, StreamFound]:
     }
 
 
-def _points(recording: Recording) -> PointsFound | None:
+def _points(recording: Recording) -> PointsSummary | None:
     camera = recording.camera
     if camera is None:
         return None
     count = camera.usable.sum(axis=1)
-    return PointsFound(len(camera.names), len(count), float(count.mean()), int((count == 0).sum()))
+    return PointsSummary(
+        len(camera.names), len(count), float(count.mean()), int((count == 0).sum())
+    )
 
 
 def _hidden(usable: Flags) -> dict[str, int]:
@@ -197,9 +206,9 @@ def _hidden(usable: Flags) -> dict[str, int]:
 
 def _found(
     time_ns: Times, usable: Flags, masked: dict[str, int], dropped: dict[str, int]
-) -> StreamFound:
+) -> StreamSummary:
     step = float(np.median(np.diff(time_ns))) / NANOSECONDS if len(time_ns) > 1 else np.nan
-    return StreamFound(
+    return StreamSummary(
         len(time_ns),
         int(usable.sum()),
         1.0 / step if step > 0.0 else np.nan,
@@ -245,7 +254,7 @@ def _accounted(recording: Recording, label: str, warnings: list[str], notes: lis
         (notes if name.startswith(_EXPECTED) else warnings).append(text)
 
 
-def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
+def _of_time(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
     warnings = []
     imu = streams.get("imu")
     long = [b - a for a, b in imu.gaps.spans if b - a > _LONG_IMU_GAP_S] if imu else []
@@ -273,12 +282,12 @@ def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
 def _of_clocks(aligned: RunAlignment) -> list[str]:
     made = aligned.tracker
     warnings = list(aligned.notes)
-    if is_late(made) and not drifts(made):
+    if has_latency(made) and not has_drift(made):
         warnings.append(
             f"the tracker's samples are {1e3 * made.latency_s:.1f} ms older than stamped, by the IMU's"
             " clock: jaxekf align writes a calibration that makes it good"
         )
-    if (turned := turned_deg(made)) is not None:
+    if (turned := misalignment_deg(made)) is not None:
         warnings.append(
             f"the tracked frame is turned by {turned[0]:.1f} deg against the IMU's: jaxekf align"
             " writes a calibration that makes it good"
@@ -302,3 +311,12 @@ def _of_units(recording: Recording, found: Evidence) -> list[str]:
             f"the tool is up to {found.farthest:.3g} m from the reference's origin: are these metres?"
         )
     return warnings
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "PointsFound": "PointsSummary",
+        "StreamFound": "StreamSummary",
+    },
+)

@@ -55,9 +55,9 @@ def check(recording: Recording, found: Evidence) -> None:
     """As `require`, with the evidence at hand."""
     for label in (tracker_label(recording), "camera"):
         if overlap_s(found.ranges_s, label) < 0.0:
-            raise _apart(recording, found, label)
+            raise _no_overlap(recording, found, label)
     _check_truth(recording)
-    force = _force(recording, found)
+    force = _force_unit(recording, found)
     rate = rates_unit(found)
     if rate is not None:
         raise fault(
@@ -105,7 +105,7 @@ def _unit(ratio: float, factor: float, within: float, names: tuple[str, str]) ->
     return None
 
 
-def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] | None:
+def _force_unit(recording: Recording, found: Evidence) -> tuple[str, RecordingError] | None:
     """The accelerometer's unit to state instead, and the fault."""
     gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     norm = found.static_norm
@@ -194,9 +194,9 @@ def _check_order(recording: Recording, found: Evidence) -> None:
     """A quaternion whose order, or whose direction, is not as stated."""
     left = 1.0 - found.explained
     fits = {
-        name: made
-        for name, made in found.readings.items()
-        if made.share > EXPLAINED and left > _BETTER * (1.0 - made.share)
+        name: fit
+        for name, fit in found.readings.items()
+        if fit.explained > EXPLAINED and left > _BETTER * (1.0 - fit.explained)
     }
     enough = found.second_axis > _TWO_AXES and found.rate > LEAST_RATE
     if not fits or not enough or not found.explained < _POOR:
@@ -215,12 +215,12 @@ def _check_order(recording: Recording, found: Evidence) -> None:
         "optical.quaternion",
         f"quaternions of which, as '{about}', the gyroscope explains"
         f" {100.0 * found.explained:.0f} % of the turning",
-        f"more; read otherwise it explains {100.0 * fits[names[0]].share:.0f} %",
+        f"more; read otherwise it explains {100.0 * fits[names[0]].explained:.0f} %",
         f"[optical] {entries}{also}; where a header names the columns, naming them as they are",
     )
 
 
-def _apart(recording: Recording, found: Evidence, label: str) -> RecordingError:
+def _no_overlap(recording: Recording, found: Evidence, label: str) -> RecordingError:
     words = [
         f"{name} from {_seconds(found.ranges_s[name][0])} to {_seconds(found.ranges_s[name][1])} s"
         for name in (label, "imu")

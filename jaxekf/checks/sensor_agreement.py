@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf.calibration import motion_agreement
-from jaxekf.calibration.motion_agreement import Fit, Turns
+from jaxekf.calibration.motion_agreement import MotionFit, RelativeRotations
 from jaxekf.pose_solvers.marker_pose import from_markers
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.facts import BODY_TO_REFERENCE
@@ -41,7 +41,7 @@ class Evidence:
     """What was measured of a recording; NaN for what it does not tell."""
 
     turns: int = 0
-    """Turns of the tracker that were compared with the gyroscope."""
+    """RelativeRotations of the tracker that were compared with the gyroscope."""
     rate: float = np.nan
     """Root mean square rate of the tracker, rad/s."""
     second_axis: float = np.nan
@@ -54,7 +54,7 @@ class Evidence:
     """Of the turns as vectors, in the order and direction of the quaternion that fits best."""
     explained: float = np.nan
     """Share of the tracker's turning that the gyroscope explains, frames aligned."""
-    readings: dict[str, Fit] = field(default_factory=dict)
+    readings: dict[str, MotionFit] = field(default_factory=dict)
     """The same were the quaternion in another order, or of the other direction."""
     static_norm: float = np.nan
     """The accelerometer's in the quietest seconds, m/s^2."""
@@ -82,7 +82,7 @@ class Evidence:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; angles in degrees."""
-        told = {name: found.share for name, found in self.readings.items()}
+        measured = {name: found.explained for name, found in self.readings.items()}
         return {
             "turns": self.turns,
             "rate_deg_s": self.rate * DEGREES,
@@ -91,7 +91,7 @@ class Evidence:
             "rate_ratio": self.rate_ratio,
             "rate_correlation": self.rate_correlation,
             "explained": self.explained,
-            "explained_otherwise": told,
+            "explained_otherwise": measured,
             "static_norm": self.static_norm,
             "mean_force": self.mean_force,
             "mean_force_ref": list(self.mean_force_ref),
@@ -105,44 +105,46 @@ class Evidence:
 def evidence(recording: Recording) -> Evidence:
     """What tracker and IMU of a run say of units, order and time; quick, for a run of any length."""
     tracker, imu = recording.optical or recording.markers, recording.imu
-    told: dict[str, Any] = {"ranges_s": _ranges(recording)}
+    measured: dict[str, Any] = {"ranges_s": _ranges(recording)}
     if imu is not None:
-        told["static_norm"], told["static_scatter"] = static_norm(imu)
+        measured["static_norm"], measured["static_scatter"] = static_norm(imu)
     if isinstance(tracker, Markers):
-        told["length_ratio"] = marker_ratio(tracker)
-        told["length_correlation"] = 1.0 if np.isfinite(told["length_ratio"]) else np.nan
+        measured["length_ratio"] = marker_ratio(tracker)
+        measured["length_correlation"] = 1.0 if np.isfinite(measured["length_ratio"]) else np.nan
     if tracker is None or imu is None:
-        return Evidence(**told)
-    told["overlap_s"] = overlap_s(told["ranges_s"], tracker_label(recording))
+        return Evidence(**measured)
+    measured["overlap_s"] = overlap_s(measured["ranges_s"], tracker_label(recording))
     if isinstance(tracker, Optical):
         rows = np.flatnonzero(tracker.valid)
         valid = tracker.valid.copy()
-        valid[rows[motion_agreement.strays(tracker.q_ref_body[rows])]] = False
+        valid[rows[motion_agreement.outlying_poses(tracker.q_ref_body[rows])]] = False
         tracker = replace(tracker, valid=valid)
-    made = _turns(tracker, imu)
-    if made is None:
-        return Evidence(**told)
-    stated, others = motion_agreement.fit(made.tracker, made.gyroscope), {}
+    rotations = _rotations(tracker, imu)
+    if rotations is None:
+        return Evidence(**measured)
+    stated, others = motion_agreement.fit(rotations.tracker, rotations.gyroscope), {}
     if isinstance(tracker, Optical):
-        others = motion_agreement.readings(made, _other_readings(recording))
-    best = max([stated, *others.values()], key=lambda found: found.share)
-    told |= {
-        "turns": len(made.span),
-        "rate": float(np.sqrt(np.mean(np.sum(made.tracker**2, axis=1) / made.span**2))),
-        "second_axis": motion_agreement.second_axis(made.gyroscope),
-        "lag_s": made.lag_s,
-        "rate_ratio": best.ratio if np.sqrt(best.share) > ALIKE else np.nan,
-        "rate_correlation": float(np.sqrt(best.share)),
-        "explained": stated.share,
+        others = motion_agreement.fit_readings(rotations, _other_readings(recording))
+    best = max([stated, *others.values()], key=lambda found: found.explained)
+    measured |= {
+        "turns": len(rotations.duration_s),
+        "rate": float(
+            np.sqrt(np.mean(np.sum(rotations.tracker**2, axis=1) / rotations.duration_s**2))
+        ),
+        "second_axis": motion_agreement.second_axis_share(rotations.gyroscope),
+        "lag_s": rotations.lag_s,
+        "rate_ratio": best.rate_ratio if np.sqrt(best.explained) > ALIKE else np.nan,
+        "rate_correlation": float(np.sqrt(best.explained)),
+        "explained": stated.explained,
         "readings": others,
     }
-    if stated.share > EXPLAINED:
-        told["mean_force_ref"] = tuple(
-            motion_agreement.mean_force(made, imu, stated.frame).tolist()
+    if stated.explained > EXPLAINED:
+        measured["mean_force_ref"] = tuple(
+            motion_agreement.mean_force(rotations, imu, stated.frame).tolist()
         )
     if isinstance(tracker, Optical):
-        told |= _lengths(tracker, imu, made, stated)
-    return Evidence(**told)
+        measured |= _lengths(tracker, imu, rotations, stated)
+    return Evidence(**measured)
 
 
 def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
@@ -170,25 +172,27 @@ def tracker_label(recording: Recording) -> str:
     return "optical" if recording.optical is not None else "markers"
 
 
-def _turns(tracker: Optical | Markers, imu: Imu) -> Turns | None:
+def _rotations(tracker: Optical | Markers, imu: Imu) -> RelativeRotations | None:
     if isinstance(tracker, Optical):
         rows = np.flatnonzero(tracker.valid)
-        t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
-        return motion_agreement.turns(t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu)
+        t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
+        return motion_agreement.relative_rotations(
+            t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu
+        )
     rows = np.flatnonzero(tracker.usable.sum(axis=1) >= 3)
-    t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
+    t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
 
     def attitude(chosen: Indices) -> Floats:
-        return from_markers(some_frames(tracker, rows[chosen])).q_ref_body
+        return from_markers(select_frames(tracker, rows[chosen])).q_ref_body
 
-    return motion_agreement.turns(t, attitude, imu, _MARKER_PAIRS)
+    return motion_agreement.relative_rotations(t, attitude, imu, _MARKER_PAIRS)
 
 
-def _since(time_ns: Times, imu: Imu) -> Floats:
+def _seconds_since_imu_start(time_ns: Times, imu: Imu) -> Floats:
     return (time_ns - imu.time_ns[0]) / NANOSECONDS
 
 
-def some_frames(markers: Markers, rows: Indices) -> Markers:
+def select_frames(markers: Markers, rows: Indices) -> Markers:
     """Some frames of single markers, what is not usable hidden."""
     return Markers(
         markers.time_ns[rows],
@@ -199,14 +203,16 @@ def some_frames(markers: Markers, rows: Indices) -> Markers:
     )
 
 
-def _other_readings(recording: Recording) -> dict[str, motion_agreement.Reading]:
+def _other_readings(recording: Recording) -> dict[str, motion_agreement.QuaternionReading]:
     """What the quaternion may be instead, by the entry of `recording.toml` that would say so."""
     about = recording.info.get("optical_about", {})
-    said = [part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")]
-    order = ",".join([part for part in said if len(part) == 1] or "wxyz")
-    direction = next((part for part in said if len(part) > 1), "body to reference")
+    stated_parts = [
+        part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")
+    ]
+    order = ",".join([part for part in stated_parts if len(part) == 1] or "wxyz")
+    direction = next((part for part in stated_parts if len(part) > 1), "body to reference")
     turned = "reference to body" if direction == "body to reference" else "body to reference"
-    found: dict[str, motion_agreement.Reading] = {
+    found: dict[str, motion_agreement.QuaternionReading] = {
         f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
     }
     if order in _ORDERS:
@@ -249,8 +255,10 @@ def marker_ratio(markers: Markers) -> float:
     return float(np.median(np.concatenate(ratios))) if ratios else np.nan
 
 
-def _lengths(tracker: Optical, imu: Imu, made: Turns, stated: Fit) -> dict[str, float]:
-    found = motion_agreement.distance(tracker, imu, made.lag_s, stated.frame)
+def _lengths(
+    tracker: Optical, imu: Imu, rotations: RelativeRotations, stated: MotionFit
+) -> dict[str, float]:
+    found = motion_agreement.acceleration_fit(tracker, imu, rotations.lag_s, stated.frame)
     if found is None or tracker.position is None:
         return {}
     far = np.linalg.norm(tracker.position[tracker.valid], axis=1)

@@ -8,11 +8,11 @@ import click
 import numpy as np
 
 from jaxekf.calibration.alignment import (
+    CombinedAlignment,
     RunAlignment,
-    Together,
     align_run,
     calibration_for,
-    together,
+    combine_runs,
 )
 from jaxekf.calibration.attitude_alignment import AttitudeMatch
 from jaxekf.cli.console import (
@@ -56,7 +56,7 @@ def align(
     chosen = get_model(model)
     recordings = load_runs(runs, sort=sort)
     found = [align_run(recording) for recording in recordings]
-    mean = together(found)
+    mean = combine_runs(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:
         for text in run.notes:
@@ -69,7 +69,7 @@ def align(
         "kind": "jaxekf alignment",
         "model": chosen.name,
         "runs": [run_document(run) for run in found],
-        "together": _together(mean),
+        "together": _combined(mean),
         "calibration": parameters.to_document(chosen, params, {})["calibration"],
         "notes": [*mean.sentences(), *sentences],
         "provenance": made_of,
@@ -86,7 +86,7 @@ def align(
     _print(found, mean)
 
 
-def _print(found: list[RunAlignment], mean: Together) -> None:
+def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:
     rows = []
     for run in found:
         rows.append(aligned_row(run.run, "tracker", run.tracker))
@@ -176,7 +176,7 @@ def match_document(made: AttitudeMatch) -> dict[str, Any]:
     }
 
 
-def _together(mean: Together) -> dict[str, Any]:
+def _combined(mean: CombinedAlignment) -> dict[str, Any]:
     return {
         "latency_s": mean.latency_s,
         "latency_sigma_s": mean.latency_sigma_s,

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.checks.inspection import Inspection, StreamFound, inspect
+from jaxekf.checks.inspection import Inspection, StreamSummary, inspect
 from jaxekf.checks.sensor_agreement import Evidence
 from jaxekf.cli.align import aligned_row, alignment_columns, match_document, run_document
 from jaxekf.cli.console import (
@@ -168,7 +168,7 @@ def _tell(one: Checked, *, tables: bool) -> None:
     click.echo(f"{found.run}: {words[found.verdict]}\n")
 
 
-def _row(label: str, told: StreamFound) -> list[Any]:
+def _row(label: str, told: StreamSummary) -> list[Any]:
     return [
         label,
         told.samples,

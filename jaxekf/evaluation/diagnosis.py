@@ -31,12 +31,12 @@ from jaxekf.evaluation.metrics import normalised_square, scored_errors
 from jaxekf.evaluation.verdicts import (
     Fault,
     Verdict,
-    in_order,
+    insufficient_samples,
     judge_fault,
     judge_part,
     judge_sensor,
-    named_faults,
-    too_few,
+    significant_faults,
+    summary_line,
 )
 from jaxekf.geometry import manifold
 from jaxekf.recordings.types import Flags, Floats, Recording
@@ -79,9 +79,13 @@ class Diagnosis:
         """Verdicts for a person; where there are none, the numbers that speak for the estimate."""
         if self.verdicts:
             return tuple(str(verdict) for verdict in self.verdicts)
-        told = [in_order(f"NIS of {n}", s.nis) for n, s in self.sensors.items() if s.nis.samples]
+        told = [
+            summary_line(f"NIS of {n}", s.nis) for n, s in self.sensors.items() if s.nis.samples
+        ]
         told += [
-            in_order(f"NEES of {name}", part) for name, part in self.parts.items() if part.samples
+            summary_line(f"NEES of {name}", part)
+            for name, part in self.parts.items()
+            if part.samples
         ]
         return (f"nothing speaks against it: {'; '.join(told)}",) if told else ()
 
@@ -119,14 +123,14 @@ def diagnose_many(
     sensors, verdicts, notes = {}, [], []
     for name in names:
         sensors[name], said = _judge_sensor(name, [e for e in estimates if name in e.sensors])
-        if note := too_few(name, sensors[name].nis):
+        if note := insufficient_samples(name, sensors[name].nis):
             notes.append(note)
         else:
             verdicts += said
     parts = {}
     for name, squares in _errors(estimates, recordings or []).items():
         parts[name] = judge_squares(squares, [np.full(len(s), 3) for s in squares])
-        if note := too_few(f"NEES of {name}", parts[name], truth=True):
+        if note := insufficient_samples(f"NEES of {name}", parts[name], truth=True):
             notes.append(note)
         else:
             verdicts += judge_part(name, parts[name])
@@ -167,7 +171,7 @@ def _judge_sensor(
     known = [found for found in each if found is not None and found.rows]
     faults = _pooled(known)
     diagnosis = SensorDiagnosis(nis, whiteness, faults)
-    named = named_faults(faults)
+    named = significant_faults(faults)
     verdicts = [judge_fault(name, nis, fault) for fault in named]
     if named:
         rows = attitude_rows(estimates[0], name)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.evaluation.consistency import BAND, Consistency, Whiteness
 
 FEWEST = 50
@@ -70,7 +71,7 @@ class Verdict:
         return self.sentence
 
 
-def named_faults(faults: Sequence[Fault]) -> list[Fault]:
+def significant_faults(faults: Sequence[Fault]) -> list[Fault]:
     """Those faults that are certain, and matter."""
     largest = max((fault.effect for fault in faults), default=0.0)
     least = max(_EFFECT, _LESSER * largest)
@@ -266,7 +267,7 @@ def judge_part(part: str, nees: Consistency) -> list[Verdict]:
     return []
 
 
-def too_few(about: str, squares: Consistency, *, truth: bool = False) -> str:
+def insufficient_samples(about: str, squares: Consistency, *, truth: bool = False) -> str:
     """Why there is no verdict on a sensor or part; empty where there is enough to judge."""
     if squares.samples < FEWEST:
         return f"{about}: {squares.samples} samples are too few to judge, {FEWEST} are needed"
@@ -278,10 +279,20 @@ def too_few(about: str, squares: Consistency, *, truth: bool = False) -> str:
     return ""
 
 
-def in_order(about: str, squares: Consistency) -> str:
+def summary_line(about: str, squares: Consistency) -> str:
     """Numbers on which a verdict is based, in a line."""
     low, high = squares.interval
     return (
         f"{about} {squares.mean:.2f} ({low:.2f} to {high:.2f}), {100 * squares.inside:.0f} % inside the"
         f" {100 * BAND:.0f} % band"
     )
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "in_order": "summary_line",
+        "named_faults": "significant_faults",
+        "too_few": "insufficient_samples",
+    },
+)

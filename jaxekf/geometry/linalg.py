@@ -5,6 +5,8 @@ arithmetic; these functions are plain arithmetic which XLA fuses. Matrices stand
 whatever axes follow are *lanes*: independent problems, usually runs, side by side in memory.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -65,6 +67,16 @@ def covariance(deviation: Array, dim: int) -> Array:
     """Covariance (dim, dim) of a noise parameter, see `standard_deviation_factor`."""
     factor = standard_deviation_factor(deviation, dim)
     return factor @ factor.T
+
+
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """The block-diagonal matrix (n, n) of square matrices, in order."""
+    return jnp.block(
+        [
+            [row if i == j else jnp.zeros((len(row), len(b))) for j, b in enumerate(blocks)]
+            for i, row in enumerate(blocks)
+        ]
+    )
 
 
 def mask_covariance(matrix: Array, mask: Array) -> Array:

@@ -148,7 +148,7 @@ def float_type(*arrays: Array) -> jnp.dtype:
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
-def least_told(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
+def default_threshold(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
     """`least`, or the square root of the rounding error: half of all digits are left there."""
     return float(jnp.finfo(dtype).eps) ** 0.5 if least is None else least
 
@@ -183,7 +183,7 @@ def _triad_axes(
     first, first_usable = directions(jnp.asarray(first, dtype))
     second, second_usable = directions(jnp.asarray(second, dtype))
     squared_sine = jnp.sum(jnp.cross(first, second) ** 2)
-    told = first_usable & second_usable & (squared_sine > least_told(least_sine, dtype) ** 2)
+    told = first_usable & second_usable & (squared_sine > default_threshold(least_sine, dtype) ** 2)
     eye = jnp.eye(3, dtype=dtype)
     first, second = jnp.where(told, first, eye[0]), jnp.where(told, second, eye[1])
     normal = rotation.normalise(jnp.cross(first, second))

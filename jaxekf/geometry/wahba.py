@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxekf.geometry import linalg, rotation
-from jaxekf.geometry.triad import Attitude, attitude_or, directions, float_type, least_told
+from jaxekf.geometry.triad import Attitude, attitude_or, default_threshold, directions, float_type
 
 
 def q_method(
@@ -37,7 +37,7 @@ def q_method(
     b, r, share = _pairs(body, reference, weights)
     profile = jnp.sum(share[:, None, None] * r[:, :, None] * b[:, None, :], axis=0)
     values, columns = jnp.linalg.eigh(lax.stop_gradient(_davenport(profile)))
-    told = values[3] - values[2] > least_told(least_gap, profile.dtype)
+    told = values[3] - values[2] > default_threshold(least_gap, profile.dtype)
     q = jnp.where(told, columns[:, 3], rotation.identity().astype(profile.dtype))
     profile = jnp.where(told, profile, jnp.eye(3, dtype=profile.dtype))
     q = _with_derivatives(q, profile)
@@ -72,7 +72,7 @@ def q_method_covariance(
     noise = jnp.sum((share * share * variances)[:, None, None] * across, axis=0)
     # Its eigenvalues add up to 2 and none exceeds 1: the determinant is about the smallest, which is
     # half the gap of `q_method`.
-    told = 2.0 * _determinant(information) > least_told(least_gap, b.dtype)
+    told = 2.0 * _determinant(information) > default_threshold(least_gap, b.dtype)
     inverse = _inverse(jnp.where(told, information, jnp.eye(3, dtype=b.dtype)))
     return jnp.where(told, linalg.congruence(inverse, noise), jnp.eye(3, dtype=b.dtype))
 

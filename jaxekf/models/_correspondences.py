@@ -50,7 +50,7 @@ class Point(NamedTuple):
     """Reported standard deviation, pixels; 0 where none was reported; ()."""
 
 
-class SeenPoint(NamedTuple):
+class BilinearPoint(NamedTuple):
     """The same where the image point goes into the slope."""
 
     p_ref_landmark: Any
@@ -79,7 +79,7 @@ def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
     place, sigma, value = (_filled(a, short) for a in (place, sigma, pixel))
     aux: Any = Point(place, sigma)
     if bilinear:
-        aux = SeenPoint(place, sigma, value, _depth(stream, place, recording))
+        aux = BilinearPoint(place, sigma, value, _depth(stream, place, recording))
         value = np.zeros_like(value)
     rows = np.repeat(_filled(mask, short), 2, axis=1)
     taken = stream.time_ns - stream.latency_ns
@@ -127,7 +127,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     if first is None:
         enough = int((stream.usable[fit].sum(axis=1) >= pnp.FEWEST).sum())
         if enough:
-            raise pnp.no_pose(recording.path or recording.name, enough)
+            raise pnp.no_pose_error(recording.path or recording.name, enough)
         return None
     known: dict[str, Any] = {
         "position": found.position[first],
@@ -161,7 +161,7 @@ def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
     will_do = _GOOD * np.where(sure, 1.0 + waited / _PATIENCE_S, 1.0)
     some = _FIRST
     while True:
-        found = pnp.solved(stream)
+        found = pnp.cached_poses(stream)
         solved[np.flatnonzero(fit)[:some]] = True
         if found is None:
             found = pnp.poses(replace(stream, visible=stream.visible & solved[:, None]))

@@ -48,7 +48,7 @@ SETUP = Setup(
 )
 
 
-def need_both(recording: Recording) -> Imu:
+def require_marg_imu(recording: Recording) -> Imu:
     """The IMU's samples whose rate and specific force are finite; its magnetometer may be slower.
 
     Raises `RecordingError`, which says which of its sensors is not there: one that reads zeros only is not.
@@ -86,7 +86,7 @@ def setup(recording: Recording) -> Setup:
     """Up and north as a recording states them, and the field's dip as it is felt in the run.
 
     Raises `RecordingError` where the stated field is vertical, so that it has no north, or where what is
-    stated is no vector, and what `need_both` raises.
+    stated is no vector, and what `require_marg_imu` raises.
     """
     known = facts.known_entries(recording.info, recording.path or recording.name)
     gravity = np.array(known.get("gravity_ref", GRAVITY_REF))
@@ -101,7 +101,7 @@ def setup(recording: Recording) -> Setup:
             "stating another field_ref or gravity_ref in recording.toml",
             column="field_ref",
         )
-    dip = float(np.nanmedian(tilt.field(need_both(recording)).dip))
+    dip = float(np.nanmedian(tilt.magnetic_field(require_marg_imu(recording)).dip))
     return Setup(gravity, dipping(up, level / np.linalg.norm(level), dip))
 
 

@@ -132,19 +132,12 @@ def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (12, 12) of angle, velocity and bias noise over ``dt``, in the IMU's axes."""
     noise = params.noise
     densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
-    return dt * block_diagonal([linalg.covariance(d, 3) for d in densities])
-
-
-def block_diagonal(blocks: list[Array]) -> Array:
-    """Square matrices (3, 3) on a diagonal."""
-    zero = jnp.zeros((3, 3))
-    rows = [[b if i == j else zero for j in range(len(blocks))] for i, b in enumerate(blocks)]
-    return jnp.block(rows)
+    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def initial_covariance(params: Parameters) -> Array:
     """Covariance of a belief of independent parts of three numbers each, such as (15, 15)."""
-    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
+    return linalg.block_diagonal([linalg.covariance(d, 3) for d in params.initial])
 
 
 def initial_mean(first: Any) -> State:
@@ -212,7 +205,13 @@ def _object_velocity_noise(u: InputSample, params: Parameters) -> Array:
     return jnp.sum(arm * arm) * jnp.max(each) * jnp.eye(3)
 
 
-__getattr__ = renamed(__name__, {"STANDARD_GRAVITY": "GRAVITY_REF"})
+__getattr__ = renamed(
+    __name__,
+    {
+        "STANDARD_GRAVITY": "GRAVITY_REF",
+        "block_diagonal": "jaxekf.geometry.linalg:block_diagonal",
+    },
+)
 
 _IN_REFERENCE = Euclidean(3, "m", frame="reference")
 _SPEED = Euclidean(3, "m/s", frame="reference")

@@ -16,7 +16,7 @@ from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import sources
+from jaxekf.models import inertial, sources
 
 
 class State(NamedTuple):
@@ -106,19 +106,23 @@ def optical_noise(params: Parameters, aux: Any, dt: Array) -> Array:
     return linalg.covariance(params.noise.optical, 3)
 
 
+def first_values(
+    first: Mapping[str, Any], attitude_sensor: str = "optical"
+) -> tuple[Array, Array, Array]:
+    """Attitude (4,), rate (3,) and bias (3,) of the first visible samples.
+
+    The identity stands in for a missing attitude, zero for a missing rate; the bias is zero.
+    """
+    attitude, rate = first.get(attitude_sensor), first.get("gyroscope")
+    q = rotation.identity() if attitude is None else rotation.normalise(jnp.asarray(attitude))
+    zero = jnp.zeros(3, q.dtype)
+    return q, zero if rate is None else jnp.asarray(rate), zero
+
+
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude (the identity if there is none) and no bias."""
-    seen = first.get("optical")
-    q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
-    return State(q, jnp.zeros(3, q.dtype))
-
-
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (6, 6)."""
-    zero = jnp.zeros((3, 3))
-    attitude = linalg.covariance(params.initial.attitude, 3)
-    bias = linalg.covariance(params.initial.bias, 3)
-    return jnp.block([[attitude, zero], [zero, bias]])
+    """The first visible attitude (the identity if there is none) and zero bias."""
+    q, _, bias = first_values(first)
+    return State(q, bias)
 
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:
@@ -160,7 +164,7 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
     input=Input(
         "gyroscope",

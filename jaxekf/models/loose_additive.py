@@ -13,7 +13,6 @@ the predicted one.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -68,13 +67,9 @@ def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> Sta
 
 
 def _block_diagonal(leaves: tuple[Any, Any, Any]) -> Array:
-    blocks = [linalg.covariance(leaf, dim) for leaf, dim in zip(leaves, (4, 3, 3), strict=True)]
-    rows = []
-    for i, row in enumerate(blocks):
-        rows.append(
-            [row if i == j else jnp.zeros((row.shape[0], b.shape[0])) for j, b in enumerate(blocks)]
-        )
-    return jnp.block(rows)
+    return linalg.block_diagonal(
+        [linalg.covariance(leaf, dim) for leaf, dim in zip(leaves, (4, 3, 3), strict=True)]
+    )
 
 
 def process_noise(params: Parameters, dt: Array) -> Array:
@@ -105,9 +100,7 @@ def project(x: State) -> State:
 
 def initial_mean(first: Mapping[str, Any]) -> State:
     """The first visible attitude, the first measured rate, and no bias."""
-    start = loose.initial_mean(first)
-    rate = first.get("gyroscope")
-    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
+    return State(*loose.first_values(first))
 
 
 def initial_covariance(params: Parameters) -> Array:

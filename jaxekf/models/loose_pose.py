@@ -67,7 +67,7 @@ def predict_pose(x: inertial.State, u: Any, params: Parameters, aux: Any) -> Pos
 def pose_noise(params: Parameters, aux: Any, dt: Array) -> Array:
     """Covariance (6, 6) of a pose; `aux` is its reported error in metres."""
     position = linalg.covariance(params.noise.position, 3) + aux * aux * jnp.eye(3)
-    return inertial.block_diagonal([position, linalg.covariance(params.noise.optical, 3)])
+    return linalg.block_diagonal([position, linalg.covariance(params.noise.optical, 3)])
 
 
 def raw_pose(recording: Recording) -> Optical:
@@ -94,7 +94,7 @@ def _setup(recording: Recording) -> Setup:
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first visible pose that can be believed (`pose.first_steady`; of single markers also one that
+    """The first visible pose that can be believed (`pose.first_consistent_pose`; of single markers also one that
     fits the tool); what came before is dropped."""
     seen = samples["optical"]
     visible = np.asarray(seen.mask.all(axis=1))
@@ -103,7 +103,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     arm = _tracked_point(recording)
     origin = seen.value.position - sources.turned(seen.value.q_ref_body, arm)
     poses = Optical(seen.time_ns, seen.value.q_ref_body, visible, origin)
-    first = marker_pose.first_steady(poses, recording.need_imu())
+    first = marker_pose.first_consistent_pose(poses, recording.need_imu())
     if first is None:
         return None
     skipped = int(visible[:first].sum())

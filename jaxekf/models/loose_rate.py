@@ -16,7 +16,7 @@ from jax import Array
 from jaxekf.filtering.model import Model, Output, Parameters, Sensor
 from jaxekf.geometry import linalg
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import loose, sources
+from jaxekf.models import inertial, loose, sources
 
 
 class State(NamedTuple):
@@ -84,16 +84,7 @@ def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 def initial_mean(first: Mapping[str, Any]) -> State:
     """The first visible attitude, the first measured rate, and no bias."""
-    start = loose.initial_mean(first)
-    rate = first.get("gyroscope")
-    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
-
-
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (9, 9)."""
-    blocks = [linalg.covariance(leaf, 3) for leaf in params.initial]
-    zero = jnp.zeros((3, 3))
-    return jnp.block([[blocks[i] if i == j else zero for j in range(3)] for i in range(3)])
+    return State(*loose.first_values(first))
 
 
 DEFAULTS = Parameters(
@@ -135,7 +126,7 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3, 3),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
     outputs=(
         Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),

@@ -127,7 +127,7 @@ def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (9, 9) of angle, velocity and bias noise over ``dt``."""
     noise = params.noise
     densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk)
-    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
@@ -168,9 +168,9 @@ def rest_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 def magnetometer(recording: Recording) -> Samples:
     """The field (N, 3) in units of its median norm, and by what norm and dip are off."""
-    imu = earth.need_both(recording)
+    imu = earth.require_marg_imu(recording)
     assert imu.magnetometer is not None
-    field = tilt.field(imu)
+    field = tilt.magnetic_field(imu)
     good = np.isfinite(field.dip)
     rows = earth.thinned(imu, good)
     norm, dip = np.nanmedian(field.norm), np.nanmedian(field.dip)
@@ -183,24 +183,24 @@ def magnetometer(recording: Recording) -> Samples:
 
 def velocity(recording: Recording) -> Samples:
     """Zeros (N, 3) at the instants of the pseudo-measurement, those of the magnetometer if it is fast."""
-    imu = earth.need_both(recording)
+    imu = earth.require_marg_imu(recording)
     rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
     return Samples(imu.time_ns[rows], np.zeros((len(rows), 3)), np.ones(len(rows), bool))
 
 
 def rest(recording: Recording) -> Samples:
     """Mean rates (N, 3) since the instant before, visible where the IMU rests."""
-    imu = earth.need_both(recording)
+    imu = earth.require_marg_imu(recording)
     rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyroscope, axis=0)])
     before = np.concatenate([[-1], rows[:-1]])
     mean = (total[rows + 1] - total[before + 1]) / (rows - before)[:, None]
-    return Samples(imu.time_ns[rows], mean, tilt.still(imu)[rows])
+    return Samples(imu.time_ns[rows], mean, tilt.static_samples(imu)[rows])
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
     """The first magnetometer sample that gives an attitude with the mean specific force after it."""
-    imu, about = earth.need_both(recording), earth.setup(recording)
+    imu, about = earth.require_marg_imu(recording), earth.setup(recording)
     assert imu.accelerometer is not None
     seen = samples["magnetometer"]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accelerometer, axis=0)])

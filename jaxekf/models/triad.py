@@ -14,14 +14,13 @@ components is taken. All is by derivation from ``q exp((rate - bias) dt)``.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
-from jaxekf.geometry import linalg, rotation, triad
+from jaxekf.geometry import linalg, triad
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import _earth as earth
 from jaxekf.models import inertial, loose, sources
@@ -103,9 +102,9 @@ def attitude_noise(params: Parameters, aux: Readings, dt: Array) -> Array:
 
 def attitude(recording: Recording) -> Samples:
     """Attitudes (N, 4) of each pair of readings; parallel vectors and what was not read are masked."""
-    imu, about = earth.need_both(recording), earth.setup(recording)
+    imu, about = earth.require_marg_imu(recording), earth.setup(recording)
     assert imu.accelerometer is not None and imu.magnetometer is not None
-    norm = np.nanmedian(tilt.field(imu).norm)
+    norm = np.nanmedian(tilt.magnetic_field(imu).norm)
     force, field = imu.accelerometer, imu.magnetometer / norm
     found = earth.attitudes(force, field, about)
     valid = np.asarray(found.valid) & np.isfinite(field).all(axis=1)
@@ -115,9 +114,8 @@ def attitude(recording: Recording) -> Samples:
 
 def initial_mean(first: Mapping[str, Any]) -> State:
     """The first attitude (the identity if there is none) and no bias."""
-    seen = first.get("attitude")
-    q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
-    return State(q, jnp.zeros(3, q.dtype))
+    q, _, bias = loose.first_values(first, "attitude")
+    return State(q, bias)
 
 
 DEFAULTS = Parameters(

@@ -26,7 +26,7 @@ from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.geometry.pinhole import Lens
 from jaxekf.models import _correspondences as correspondences
 from jaxekf.models import inertial, sources
-from jaxekf.models._correspondences import Point, SeenPoint
+from jaxekf.models._correspondences import BilinearPoint, Point
 from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.types import Recording, Samples
 
@@ -147,7 +147,7 @@ def process_noise(params: Parameters, dt: Array) -> Array:
         noise.bias_walk,
         noise.accelerometer_walk,
     )
-    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
@@ -188,13 +188,13 @@ def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
     return (params.noise.pixel**2 + aux.sigma**2) * jnp.eye(2)
 
 
-def predict_bilinear(x: State, u: Any, params: Parameters, aux: SeenPoint) -> Array:
+def predict_bilinear(x: State, u: Any, params: Parameters, aux: BilinearPoint) -> Array:
     """Eq. 11c: how far (2,), metres, the landmark lies off the ray of its image point, beside the axis."""
     p = in_camera(x, params, aux.p_ref_landmark)
     return p[:2] - pinhole.ray(lens_of(params), aux.pixel) * p[2]
 
 
-def bilinear_noise(params: Parameters, aux: SeenPoint, dt: Array) -> Array:
+def bilinear_noise(params: Parameters, aux: BilinearPoint, dt: Array) -> Array:
     """Covariance (2, 2), metres squared: that of the image point at the landmark's depth."""
     slope = jax.jacfwd(partial(pinhole.ray, lens_of(params)))(aux.pixel)
     variance = params.noise.pixel**2 + aux.sigma**2
@@ -325,7 +325,7 @@ def _point(count: int, bilinear: bool) -> Sensor:
     place = np.array([0.0, 0.0, 2.0])
     like: Any = Point(place, 0.0)
     if bilinear:
-        like = SeenPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
+        like = BilinearPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
     return Sensor(
         "camera",
         Euclidean(2, "m" if bilinear else "px"),

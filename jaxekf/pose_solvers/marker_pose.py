@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.truth import encoder_at
@@ -36,7 +37,7 @@ _LONGEST_STEP_S = 0.2
 _LEAST_GRAVITY_S = 0.5
 
 
-class Fit(NamedTuple):
+class MarkerPose(NamedTuple):
     """Rigid fits of many frames."""
 
     q_ref_body: Floats
@@ -50,7 +51,7 @@ class Fit(NamedTuple):
     identity."""
 
 
-def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> Fit:
+def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> MarkerPose:
     """The pose that takes markers from the body to where they are seen, least squares by SVD.
 
     `p_body_marker` (M, 3), `position` (N, M, 3) in the reference frame, `usable` (N, M); metres
@@ -76,10 +77,10 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
     off = from_ref - np.einsum("nij,nmj->nmi", matrix, from_body)
     error = np.sqrt(np.einsum("nm,nmi->n", weight, off**2))
     origin[~valid], error[~valid] = 0.0, 0.0
-    return Fit(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
+    return MarkerPose(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
 
 
-def fit_markers(markers: Markers, place: object) -> Fit:
+def fit_markers(markers: Markers, place: object) -> MarkerPose:
     """The rigid fit of every frame; raises `RecordingError` where the markers are not those of the tool.
 
     Whatever noise there is, it is small beside the tool: a larger misfit is a wrong unit, wrong names,
@@ -100,7 +101,7 @@ def fit_markers(markers: Markers, place: object) -> Fit:
     return fit
 
 
-def from_markers(markers: Markers, fit: Fit | None = None) -> Optical:
+def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
     """The raw pose a tracker would report for its markers, frame by frame, without any filter.
 
     `fit` is that of `fit_markers`, where it is known already.
@@ -128,7 +129,7 @@ def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Flo
     return (position[second] - position[first]) / step
 
 
-def first_steady(optical: Optical, imu: Imu) -> int | None:
+def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
     """The valid pose to start from: the first of those of the first second that turns to the next as the
     gyroscope did, and does not jump; where none does, the first of all. None where no pose is valid.
 
@@ -211,3 +212,12 @@ def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[
     start, early = slope(head)
     stop, late = slope(tail)
     return start, stop, (early, late)
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Fit": "MarkerPose",
+        "first_steady": "first_consistent_pose",
+    },
+)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.geometry.pinhole import NEAREST
@@ -67,25 +68,25 @@ def poses(camera: Camera, most: int | None = None) -> Resection:
 
     Kept as long as the camera is: gravity, the start and figures all ask for it.
     """
-    if (found := solved(camera)) is not None:
+    if (found := cached_poses(camera)) is not None:
         return found
     every = 1 if most is None else max(1, -(-len(camera.time_ns) // most))
     key = id(camera), every
-    if key not in _KEPT:
+    if key not in _CACHE:
         shown = np.arange(len(camera.time_ns)) % every == 0
         found = _poses(replace(camera, visible=camera.visible & shown[:, None]))
         # An id may be another camera's once this one is gone.
-        _KEPT[key] = weakref.ref(camera, lambda _: _KEPT.pop(key, None)), found
-    return _KEPT[key][1]
+        _CACHE[key] = weakref.ref(camera, lambda _: _CACHE.pop(key, None)), found
+    return _CACHE[key][1]
 
 
-def solved(camera: Camera) -> Resection | None:
+def cached_poses(camera: Camera) -> Resection | None:
     """The poses of all images where they were solved for before."""
-    kept = _KEPT.get((id(camera), 1))
+    kept = _CACHE.get((id(camera), 1))
     return None if kept is None else kept[1]
 
 
-_KEPT: dict[tuple[int, int], tuple[weakref.ref[Camera], Resection]] = {}
+_CACHE: dict[tuple[int, int], tuple[weakref.ref[Camera], Resection]] = {}
 
 
 def _poses(camera: Camera) -> Resection:
@@ -100,19 +101,19 @@ def _poses(camera: Camera) -> Resection:
     valid = np.zeros(count, bool)
     rng = np.random.default_rng(0)
     for i in np.flatnonzero(usable.sum(axis=1) >= _FEWEST_FLAT):
-        found = _start(direction[i, usable[i]], points.place[i, usable[i]], rng)
+        found = _linear_start(direction[i, usable[i]], points.place[i, usable[i]], rng)
         if found is not None:
             turn[i], away[i], valid[i] = *found, True
     for _ in range(_ITERATIONS):
-        residual, slope = _linearised(points, turn, away)
+        residual, slope = _linearise(points, turn, away)
         scale = _scale(residual, usable)
         weight = _weights(residual, scale, usable & valid[:, None])
-        step, _ = _solved(residual, slope, weight)
+        step, _ = _gauss_newton_step(residual, slope, weight)
         away = away + step[:, :3]
         turn = turn @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
         if np.abs(step[valid]).max(initial=0.0) < _STILL:
             break
-    residual, slope = _linearised(points, turn, away)
+    residual, slope = _linearise(points, turn, away)
     scale = _scale(residual, usable)
     weight = _weights(residual, scale, usable & valid[:, None])
     counted = (weight > 0.0).sum(axis=1)
@@ -122,14 +123,14 @@ def _poses(camera: Camera) -> Resection:
     # Few points fit a pose of six numbers better than they are.
     free = np.maximum(2 * counted - 6, 1)
     scale = scale * np.sqrt(np.maximum(2 * counted, 1) / free)
-    _, information = _solved(residual, slope, weight)
+    _, information = _gauss_newton_step(residual, slope, weight)
     fits = np.zeros((count, len(camera.names)), bool)
     np.put_along_axis(fits, order, (weight > 0.0) & valid[:, None], axis=1)
-    found = _of_body(camera, turn, away, information, scale, valid, fits)
-    return _among_all(found, images, len(camera.time_ns))
+    found = _body_poses(camera, turn, away, information, scale, valid, fits)
+    return _for_all_images(found, images, len(camera.time_ns))
 
 
-def _among_all(found: Resection, images: Any, count: int) -> Resection:
+def _for_all_images(found: Resection, images: Any, count: int) -> Resection:
     """The poses of some images, and those of all others unknown."""
     nothing = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros((6, 6)), 0.0, False, False)
     every = []
@@ -141,7 +142,7 @@ def _among_all(found: Resection, images: Any, count: int) -> Resection:
     return Resection(*every)
 
 
-def no_pose(place: Path | str, images: int) -> RecordingError:
+def no_pose_error(place: Path | str, images: int) -> RecordingError:
     """The error of a camera whose lens or landmarks are wrong: another run would not help."""
     return RecordingError(
         place,
@@ -209,7 +210,7 @@ def _stretch(radial: Floats, point: Floats) -> Floats:
 # --- the linear start ---------------------------------------------------------------------------------
 
 
-def _start(
+def _linear_start(
     direction: Floats, place: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats] | None:
     """The camera's axes in the reference frame (3, 3) and its place (3,), from points (M, 2) of landmarks
@@ -222,7 +223,7 @@ def _start(
     if axes[1][2] > _FLAT * axes[1][0]:
         if len(place) < FEWEST:
             return None
-        ways.append((_linear, everything, FEWEST))
+        ways.append((_direct_linear_transform, everything, FEWEST))
         # A few landmarks beside a plane that holds the others tell the linear transform next to nothing.
         plane = _largest_plane(place, rng)
         if len(plane) >= FEWEST:
@@ -261,7 +262,7 @@ def _largest_plane(place: Floats, rng: np.random.Generator) -> Any:
     return np.flatnonzero(inside[np.argmax(inside.sum(axis=1))])
 
 
-def _linear(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
+def _direct_linear_transform(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
     """By the direct linear transform: the matrix (3, 4) that takes landmarks to their rays."""
     middle = place.mean(axis=0)
     size = np.sqrt(np.mean((place - middle) ** 2)) + 1e-12
@@ -269,7 +270,7 @@ def _linear(direction: Floats, place: Floats) -> tuple[Floats, Floats] | None:
     zero = np.zeros_like(scaled)
     first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
     second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
-    matrix = _null(np.concatenate([first, second])).reshape(3, 4)
+    matrix = _null_vector(np.concatenate([first, second])).reshape(3, 4)
     matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
     if np.linalg.det(matrix[:, :3]) <= 0.0:
         return None
@@ -289,7 +290,7 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     zero = np.zeros_like(scaled)
     first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
     second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
-    matrix = _null(np.concatenate([first, second])).reshape(3, 3)
+    matrix = _null_vector(np.concatenate([first, second])).reshape(3, 3)
     matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
     length = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
     if length <= 1e-12:
@@ -301,7 +302,7 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     return towards.T, middle - size * towards.T @ matrix[:, 2] / length
 
 
-def _null(matrix: Floats) -> Floats:
+def _null_vector(matrix: Floats) -> Floats:
     """The vector that the matrix makes smallest."""
     return np.linalg.eigh(matrix.T @ matrix)[1][:, 0]
 
@@ -309,7 +310,7 @@ def _null(matrix: Floats) -> Floats:
 # --- Gauss and Newton ---------------------------------------------------------------------------------
 
 
-def _linearised(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
+def _linearise(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
     """Residuals (N, M, 2), pixels, and their derivatives (N, M, 2, 6) by the camera's place in the
     reference frame and its turn in its own, at its axes (N, 3, 3) and place (N, 3)."""
     inside = (points.place - away[:, None]) @ turn
@@ -347,7 +348,7 @@ def _weights(residual: Floats, scale: Floats, usable: Flags) -> Floats:
     return np.where(usable & (off < 1.0), (1.0 - np.minimum(off, 1.0) ** 2) ** 2, 0.0)
 
 
-def _solved(residual: Floats, slope: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _gauss_newton_step(residual: Floats, slope: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Steps (N, 6) of Gauss and Newton, and the information (N, 6, 6) at unit noise."""
     count, most = weight.shape
     flat = slope.reshape(count, 2 * most, 6)
@@ -359,7 +360,7 @@ def _solved(residual: Floats, slope: Floats, weight: Floats) -> tuple[Floats, Fl
     return np.linalg.solve(information + some, pull[..., None])[..., 0], information + some
 
 
-def _of_body(
+def _body_poses(
     camera: Camera,
     turn: Floats,
     away: Floats,
@@ -384,3 +385,12 @@ def _of_body(
     q = np.where(valid[:, None], from_scipy(body), identity)
     where = np.where(valid[:, None], position, 0.0)
     return Resection(q, where, cov, scale, valid, fits)
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "no_pose": "no_pose_error",
+        "solved": "cached_poses",
+    },
+)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.geometry.host_rotation import running_product
 from jaxekf.recordings.types import (
     NANOSECONDS,
@@ -35,7 +36,7 @@ _SLOWEST_MEAN = np.deg2rad(2.0)
 """rad/s: a gyroscope that reads more on average turns, whatever its scatter."""
 
 
-def turned(imu: Imu) -> Floats:
+def integrated_attitude(imu: Imu) -> Floats:
     """Quaternions (N, 4) that take the body at each sample to the body at the first, by gyroscope alone."""
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
@@ -53,9 +54,9 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     from scipy.signal import butter, sosfilt, sosfilt_zi
 
     assert imu.accelerometer is not None
-    resting = still(imu)
+    resting = static_samples(imu)
     bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)
-    q = to_scipy(turned(replace(imu, gyroscope=imu.gyroscope - bias)))
+    q = to_scipy(integrated_attitude(replace(imu, gyroscope=imu.gyroscope - bias)))
     force = q.apply(imu.accelerometer)
     if len(force) == 1:
         return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
@@ -68,7 +69,7 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     return inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
 
 
-def still(imu: Imu) -> Flags:
+def static_samples(imu: Imu) -> Flags:
     """(N,) whether the IMU has rested for the last second: readings scatter as little as they ever do.
 
     What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise
@@ -83,7 +84,7 @@ def still(imu: Imu) -> Flags:
     return quiet
 
 
-class Field(NamedTuple):
+class MagneticField(NamedTuple):
     """The magnetic field as it is felt."""
 
     norm: Floats
@@ -92,7 +93,7 @@ class Field(NamedTuple):
     """(N,) rad below the horizontal."""
 
 
-def field(imu: Imu) -> Field:
+def magnetic_field(imu: Imu) -> MagneticField:
     """Norm and dip at each sample of a magnetometer; NaN where it was not read."""
     assert imu.magnetometer is not None
     norm = np.linalg.norm(imu.magnetometer, axis=1)
@@ -100,7 +101,7 @@ def field(imu: Imu) -> Field:
     norm = np.where(np.isfinite(norm) & (norm > 0.0), norm, np.nan)
     with np.errstate(invalid="ignore"):
         down = -np.sum(imu.magnetometer * up_in_body(imu), axis=1) / norm
-    return Field(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
+    return MagneticField(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
 
 
 def _quiet(values: Floats, width: int, most: float) -> Flags:
@@ -118,3 +119,14 @@ def _trailing(values: Floats, width: int) -> Floats:
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - width, 0)
     return (total[end] - total[begin]) / (end - begin)[:, None]
+
+
+__getattr__ = renamed(
+    __name__,
+    {
+        "Field": "MagneticField",
+        "field": "magnetic_field",
+        "still": "static_samples",
+        "turned": "integrated_attitude",
+    },
+)

@@ -129,7 +129,7 @@ def test_a_short_rest_does_not_tell_a_walk():
     model = jaxekf.get_model("loose")
     start = start_for(model, found)
     assert set(start.taken) == {"gyroscope", "optical"}
-    assert "do not tell a random walk" in start.sentences[0]
+    assert "too short to estimate a random walk" in start.sentences[0]
     assert start.params.noise.bias_walk == model.parameters.noise.bias_walk
     np.testing.assert_allclose(start.params.noise.gyroscope, np.deg2rad(0.05), rtol=0.06)
     wide = model.parameters.noise._replace(bias_walk=np.deg2rad(1.0))
@@ -171,7 +171,7 @@ def test_what_does_not_rest_is_refused():
     """Noise of a motion: one that begins at once, and a steady turn, which looks like a bias."""
     with pytest.raises(RecordingError, match="of rest at the start"):
         static_interval.static_head(still(0, rest_s=1.0))
-    with pytest.raises(RecordingError, match="tracker that turns by"):
+    with pytest.raises(RecordingError, match="tracker that rotates by"):
         static_interval.static_head(still(0, motion=attitude_runs.constant_rate_motion(-1.0, 0.0)))
     with pytest.raises(RecordingError, match="stretch from 30"):
         static_noise(still(0), 30.0, 40.0)

@@ -1,14 +1,15 @@
-"""Clock, its drift, and frame of a tracker against an IMU, from the attitudes themselves.
+"""Clock offset, clock drift and rotation between a tracker and an IMU, from the attitudes themselves.
 
-`synchronise.match` compares turns from sample to sample, which finds clock and frame from nothing but loses
-what the sum of many turns tells. Here the tracker's attitude is compared with the integral of the gyroscope
-over two seconds at a time, each with a constant rotation of its own,
+`time_offset.match` compares rotations from sample to sample. It needs no initial values but does not use
+that many rotations add up to one attitude. `refine` starts from its result and compares the tracker's
+attitude with the integral of the gyroscope over stretches of two seconds, each with a constant rotation of
+its own,
 
     q_k  =  A_c  G(t_k - L - D (t_k - m))  F  exp(noise),
 
-Gauss and Newton on latency ``L``, drift ``D``, frame ``F`` and the bias within ``G``. In the reference
-frame ``A_c`` leaves with the mean of each stretch. Residuals may be correlated within a stretch, as those
-of a filtering tracker or a noisy gyroscope are: deviations are those of clusters.
+by Gauss-Newton on latency ``L``, drift ``D``, rotation ``F`` and the bias within ``G``. In the reference
+frame ``A_c`` is removed with the mean of each stretch. Residuals may be correlated within a stretch, as
+with a tracker that filters or a noisy gyroscope: the covariance is cluster-robust, one cluster a stretch.
 """
 
 from typing import Any, NamedTuple
@@ -32,53 +33,53 @@ _LEAST_STRETCHES = 10
 _ROUNDS = 12
 _OUTLIER_RATIO = 5.0
 _CONVERGED = 0.01
-"""Deviations within which a step ends the search."""
+"""A step smaller than this many standard deviations ends the iterations."""
 _LEAST_DRIFT_S = 20.0
 _EXPLAINED, _KEPT = 0.8, 0.8
 _LARGEST_DRIFT = 1e-3
 _PRIOR = np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2, 0.1, 1e-3])
-"""Deviations of alignment (rad), bias (rad/s), latency (s) and drift that are believed beforehand: so wide
-that they count only where nothing else tells."""
+"""Prior standard deviations of alignment (rad), bias (rad/s), latency (s) and drift, wide enough to matter
+only for unobservable parameters."""
 
 
 class AttitudeMatch(NamedTuple):
-    """How a tracker lies to an IMU in time and frame; see `synchronise.Match`."""
+    """Time offset, drift and rotation of a tracker relative to an IMU; see `time_offset.Match`."""
 
     latency_s: float
-    """In the middle of the run."""
+    """Latency in the middle of the run, s."""
     latency_sigma_s: float
     drift: float
-    """Seconds by which the latency grows in a second; NaN where the run is too short to tell."""
+    """Growth of the latency, s/s; NaN if the run is too short to estimate it."""
     drift_sigma: float
     alignment: Floats
-    """(3,) rotation vector, rad, that takes vectors of the tracked frame into the IMU's."""
+    """(3,) rotation vector, rad, tool frame to IMU frame."""
     alignment_cov: Floats
-    """(3, 3) rad^2, of a small turn in the tracked frame, applied before the alignment."""
+    """(3, 3) rad^2, of a small rotation in the tool frame, applied before the alignment."""
     bias: Floats
-    """(3,) rad/s, of the gyroscope."""
+    """(3,) rad/s, gyroscope bias."""
     scatter: float
-    """Root mean square of the residuals of an axis, rad."""
+    """Root mean square of the residuals of one axis, rad."""
     middle_s: float
     """Seconds from the IMU's first sample to the middle of the run."""
     duration_s: float
 
 
 class _Stretches(NamedTuple):
-    """Attitudes that can be compared, stretch after stretch."""
+    """Attitudes that are compared, in stretches."""
 
     t: Floats
     """(N,) seconds since the IMU's first sample, as stamped."""
     q: Rotation
-    """N of them, tracked frame to reference."""
+    """N attitudes, tool to reference."""
     begin: Indices
-    """(C,) row that each stretch begins with."""
+    """(C,) first row of each stretch."""
 
     def to_rows(self, values: Floats) -> Floats:
-        """What is said of stretches (C, ...), of their rows."""
+        """Values of stretches (C, ...), repeated for their rows (N, ...)."""
         return np.repeat(values, np.diff(self.begin, append=len(self.t)), axis=0)
 
     def remove_mean(self, values: Floats, kept: Flags) -> Floats:
-        """Values (N, ...) less the mean over the rows of their stretch that are kept."""
+        """Values (N, ...) minus the mean over the kept rows of their stretch."""
         count = np.maximum(np.add.reduceat(kept.astype(float), self.begin), 1.0)
         weight = kept.reshape(-1, *[1] * (values.ndim - 1))
         total = np.add.reduceat(values * weight, self.begin, axis=0)
@@ -86,9 +87,24 @@ class _Stretches(NamedTuple):
 
 
 def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording") -> AttitudeMatch:
-    """Latency, drift, alignment and bias of a stream of attitudes, from what `match` found.
+    """Latency, drift, alignment and bias of a stream of attitudes, from the result of `time_offset.match`.
 
-    Raises `RecordingError` where the gyroscope does not explain how the attitude turns.
+    Parameters
+    ----------
+    optical
+        Attitudes of the tool.
+    imu
+        Rates of the IMU.
+    start
+        Result of `time_offset.match`.
+    place
+        Name of the recording for error messages.
+
+    Raises
+    ------
+    RecordingError
+        If the gyroscope does not explain the rotation of the tracker, if too few stretches remain, or if
+        the clocks drift by more than 1000 ppm.
     """
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     stretches = _stretches(optical, imu, start.latency_s, place)
@@ -118,9 +134,9 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
     if abs(clock[1]) > _LARGEST_DRIFT:
         raise RecordingError(
             str(place),
-            f"a tracker's clock that gains {1e6 * clock[1]:.0f} ppm on the IMU's",
+            f"a clock drift of {1e6 * clock[1]:.0f} ppm between tracker and IMU",
             f"{1e6 * _LARGEST_DRIFT:.0f} ppm at most",
-            "streams that belong together, with clocks that do not jump",
+            "streams of one body, with clocks that do not jump",
         )
     sigma = np.sqrt(np.diagonal(solution.cov))
     drifting = duration >= _LEAST_DRIFT_S
@@ -139,14 +155,14 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
 
 
 def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Stretches:
-    """Valid attitudes within the IMU's time, in stretches in which the IMU has no gap."""
+    """Valid attitudes within the IMU's time, in stretches without a gap of the IMU."""
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     inside = (t - latency_s >= known[0] + _SPARE_S) & (t - latency_s <= known[-1] - _SPARE_S)
     rows = np.flatnonzero(optical.valid & inside)
     span = float(np.ptp(t[rows])) if rows.size else 0.0
     length = float(np.clip(span / _FEWEST_STRETCHES, _SHORTEST_S, _STRETCH_S))
-    # A gap of the IMU ends a stretch, too.
+    # A gap of the IMU ends a stretch.
     gaps = known[1:][np.diff(known) > _LONGEST_IMU_GAP_S]
     label = np.floor(t[rows] / length) + np.searchsorted(gaps, t[rows] - latency_s)
     _, number, count = np.unique(label, return_inverse=True, return_counts=True)
@@ -164,18 +180,18 @@ def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _
 
 
 class _GyroscopeIntegral(NamedTuple):
-    """The gyroscope's integral at some times."""
+    """Integral of the gyroscope's rate at some times."""
 
     q: Rotation
-    """From the IMU's frame to one that is fixed, whatever it is."""
+    """IMU frame to a fixed frame that may be any."""
     rate: Floats
     """(N, 3) rad/s."""
     q_integral: Floats
-    """(N, 3, 3) s: the integral of `q` as a matrix: what a bias does."""
+    """(N, 3, 3) s: integral over time of `q` as a matrix, the derivative by a bias."""
 
 
 def _integrate(known: Floats, rate: Floats, at: Floats) -> _GyroscopeIntegral:
-    """Rates that are linear between samples, each step integral by their mean."""
+    """Integrate rates that are linear between samples; each step rotates by their mean."""
     step = np.diff(known)
     steps = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None])
     turn = to_scipy(running_product(from_scipy(steps)))
@@ -193,8 +209,10 @@ def _integrate(known: Floats, rate: Floats, at: Floats) -> _GyroscopeIntegral:
 def _linearise(
     stretches: _Stretches, integral: _GyroscopeIntegral, frame: Rotation, kept: Flags
 ) -> tuple[Floats, Floats]:
-    """How the residuals, in the reference frame, change with alignment, bias and latency (N, 3, 7), and the
-    residuals (N, 3); of each stretch but for a constant."""
+    """Derivatives (N, 3, 7) of the residuals by alignment, bias and latency, and the residuals (N, 3), rad.
+
+    Both are in the reference frame; the mean of each stretch is removed from the residuals.
+    """
     body = integral.q * frame
     constant = _mean_rotation(stretches, stretches.q * body.inv(), kept)
     expected = constant * body
@@ -206,7 +224,7 @@ def _linearise(
 
 
 def _mean_rotation(stretches: _Stretches, each: Rotation, kept: Flags) -> Rotation:
-    """The mean over each stretch of rotations that are nearly one, for every row."""
+    """Mean of nearly equal rotations over the kept rows of each stretch, repeated for every row."""
     q = each.as_quat()
     first = stretches.to_rows(q[stretches.begin])
     q = q * np.where(np.sum(q * first, axis=1) < 0.0, -1.0, 1.0)[:, None]
@@ -217,8 +235,10 @@ def _mean_rotation(stretches: _Stretches, each: Rotation, kept: Flags) -> Rotati
 
 
 class _Solution(NamedTuple):
+    """Step of Gauss-Newton with its covariance."""
+
     step: Floats
-    """(8,); a drift that is not free is 0."""
+    """(8,); zero for a drift that is not estimated."""
     cov: Floats
     """(8, 8)."""
     residual: Floats
@@ -227,7 +247,7 @@ class _Solution(NamedTuple):
 
 
 def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> _Solution:
-    """Least squares with what is believed beforehand, and its covariance by clusters, a stretch each."""
+    """Least squares with the prior, and its cluster-robust covariance, one cluster a stretch."""
     width = columns.shape[2]
     prior = 1.0 / np.square(_PRIOR[:width])
     used = columns * kept[:, None, None]
@@ -235,12 +255,12 @@ def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> 
     square, rhs = np.einsum("nij,nik->jk", used, columns), np.einsum("nij,ni->j", used, off)
 
     def solved(about: Floats) -> tuple[float, Floats, Floats]:
-        """By the variance of some residuals."""
+        """Variance of the residuals, inverse information and step."""
         variance = max(float(np.sum(np.square(about[kept]))) / max(count, 1.0), 1e-20)
         inverse = np.linalg.inv(square / variance + np.diag(prior))
         return variance, inverse, -inverse @ rhs / variance
 
-    # The first residuals are those of a start, which may be far off.
+    # The initial values may be far off, so the variance is that after a first step.
     residual = off + columns @ solved(off)[2]
     variance, inverse, step = solved(residual)
     residual = off + columns @ step
@@ -256,23 +276,25 @@ def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> 
 
 
 def _require_agreement(stretches: _Stretches, residual: Floats, kept: Flags, place: object) -> None:
-    """The gyroscope explains most of how the attitude turns within a stretch, and in most stretches, or it
-    is of another body, or of another clock half of the time."""
+    """Raise `RecordingError` unless the gyroscope explains most of the rotation in most stretches.
+
+    Otherwise the streams are from different bodies, or a clock jumps.
+    """
     mean = _mean_rotation(stretches, stretches.q, kept)
     rotated = np.sum(np.square((mean.inv() * stretches.q).as_rotvec()[kept]))
     left = np.sum(np.square(residual[kept]))
     if np.mean(kept) < _KEPT:
         raise RecordingError(
             str(place),
-            f"a gyroscope that turns as {100.0 * np.mean(kept):.0f} % of the tracker's samples do",
+            f"a gyroscope that agrees with {100.0 * np.mean(kept):.0f} % of the tracker's samples",
             f"{100.0 * _KEPT:.0f} % or more",
-            "streams that belong together, with clocks that do not jump",
+            "streams of one body, with clocks that do not jump",
         )
     if left > (1.0 - _EXPLAINED) * rotated:
         raise RecordingError(
             str(place),
-            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / rotated):.0f} % of how the tracker"
-            " turns",
-            f"{100.0 * _EXPLAINED:.0f} % or more of one body's",
-            "streams that belong together, with clocks that do not jump",
+            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / rotated):.0f} % of the tracker's"
+            " rotation",
+            f"{100.0 * _EXPLAINED:.0f} % or more",
+            "streams of one body, with clocks that do not jump",
         )

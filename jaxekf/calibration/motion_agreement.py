@@ -1,6 +1,9 @@
-"""How a tracker and an IMU agree in turning and distance: thinned out, in NumPy alone.
+"""Agreement of a tracker and an IMU in rotation and translation, from a subset of the samples.
 
-Nothing here judges. What the streams cannot tell is NaN.
+`relative_rotations` pairs rotations of the tracker with the integrated rate of the gyroscope, `fit` finds
+the rotation and scale between them, `acceleration_fit` compares the tracker's path with the accelerometer.
+The functions measure and do not judge; a quantity that the data do not determine is NaN. They use NumPy and
+SciPy only.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,61 +26,68 @@ from jaxekf.recordings.types import (
 )
 
 LARGEST_LAG_S = 0.5
+"""Largest lag, s, that the search covers."""
 _FEWEST = 40
+"""Fewest pairs of samples from which anything is estimated."""
 _PAIRS = 4000
-"""RelativeRotations that are looked at, spread over the run."""
+"""Pairs of samples that are compared, spread over the run."""
 _SEARCHED = 1500
-"""Of them, those by which the lag is searched for."""
+"""Pairs among them that the lag search uses."""
 _SPANS_S = (0.1, 0.4, 1.0)
+"""Time spans, s, of a relative rotation, tried in turn until the rotations are clear."""
 _CLEAR_ROTATION = np.deg2rad(5.0)
-"""A turn that is well above a tracker's noise: a slower tool is watched for longer."""
+"""A rotation well above a tracker's noise, rad; for slower motion the next longer span is tried."""
 _OUTLIER_SHARE = 0.1
-"""Share of the worst turns that is left out: wrong poses."""
+"""Share of the largest residuals that is left out: wrong poses."""
 _OUTLYING_ROTATION = np.deg2rad(3.0)
 _HALF_WIDTH_S = 0.2
+"""Half the time span of a second difference of positions, s."""
 _NODES = 13
+"""Integration nodes over the span of a second difference."""
 _CENTRES = 1500
+"""Second differences that are compared."""
 
 QuaternionReading = Callable[[Floats], Floats]
-"""Quaternions (N, 4) as read to those that another order or direction would give."""
+"""Takes quaternions (N, 4) as read to those of another component order or direction."""
 
 
 class RelativeRotations(NamedTuple):
-    """How the tracker tracked, and the gyroscope meanwhile."""
+    """Rotations of the tracker between pairs of samples, and of the gyroscope over the same time."""
 
     tracker: Floats
-    """(N, 3) rotation vectors, rad."""
+    """(N, 3) rotation vectors, rad, frame of the tracked tool."""
     gyroscope: Floats
-    """(N, 3) rad, integral of the rate at the lag found."""
+    """(N, 3) rad, integral of the rate at the lag found, IMU frame."""
     duration_s: Floats
     """(N,) s."""
     lag_s: float
-    """To be taken from the tracker's stamps."""
+    """Lag that was subtracted from the tracker's time stamps, s."""
     q_begin: Floats
-    """(N, 4) quaternions at which the turns begin."""
+    """(N, 4) attitudes at the beginning of each pair."""
     q_end: Floats
+    """(N, 4) attitudes at the end of each pair."""
     begin_s: Floats
-    """(N,) seconds from the IMU's first sample at which they begin, lag taken off."""
+    """(N,) beginning of each pair, s from the IMU's first sample, lag subtracted."""
 
 
 class MotionFit(NamedTuple):
-    """How well the gyroscope's turns, rotated and scaled, are the tracker's."""
+    """Least-squares fit of the gyroscope's rotations, rotated and scaled, to the tracker's."""
 
     explained: float
-    """Of the tracker's turning that is explained, in squares; 0 to 1."""
+    """Share of the tracker's squared rotation that the gyroscope explains, 0 to 1."""
     rate_ratio: float
-    """Gyroscope's rate to the tracker's."""
+    """Rate of the gyroscope over that of the tracker."""
     frame: Floats
-    """(3, 3) that takes vectors of the IMU's frame into the tracked one."""
+    """(3, 3) rotation matrix, IMU frame to tool frame."""
 
     @property
     def angle(self) -> float:
-        """Of the frames' rotation, rad."""
+        """Angle of `frame`, rad."""
         return float(np.arccos(np.clip(0.5 * (np.trace(self.frame) - 1.0), -1.0, 1.0)))
 
 
 class Integral:
-    """The integral over time of a stream of vectors, linear between samples."""
+    """Integral over time of a stream of vectors, piecewise linear between the samples."""
 
     def __init__(self, time_ns: Times, values: Floats) -> None:
         self.t = (time_ns - time_ns[0]) / NANOSECONDS
@@ -85,7 +95,7 @@ class Integral:
         self.sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
     def between(self, begin: Floats, end: Floats) -> Floats:
-        """(N, 3) from one time to another, seconds from the first sample."""
+        """Integral (N, 3) from times `begin` to `end` (N,), s from the first sample."""
         sums = self.sums.T
         return np.stack(
             [np.interp(end, self.t, s) - np.interp(begin, self.t, s) for s in sums], axis=1
@@ -95,7 +105,23 @@ class Integral:
 def sample_pairs(
     t: Floats, span_s: float, last_s: float, most: int = _PAIRS
 ) -> tuple[Indices, Indices]:
-    """Rows (N,) of times, about a span apart, within 0 and the last second with room for a lag."""
+    """Pairs of samples about one time span apart.
+
+    Parameters
+    ----------
+    t
+        (N,) sample times, s from the IMU's first sample.
+    span_s
+        Time span of a pair, s; pairs up to 1.5 times as long are accepted.
+    last_s
+        Last time of the IMU, s. Pairs keep a margin to both ends, for the lag.
+    most
+        Largest number of pairs, about.
+
+    Returns
+    -------
+    Indices (M,) of the first and of the second sample of each pair.
+    """
     room = min(LARGEST_LAG_S, 0.1 * last_s)
     begin = np.flatnonzero((t >= room) & (t <= last_s - room - span_s))
     begin = begin[:: max(1, -(-len(begin) // most))]
@@ -109,9 +135,22 @@ def sample_pairs(
 def relative_rotations(
     t: Floats, attitude: Callable[[Indices], Floats], imu: Imu, most: int = _PAIRS
 ) -> RelativeRotations | None:
-    """RelativeRotations between attitudes that are valid at times t (N,), seconds from the IMU's first sample.
+    """Relative rotations of tracker and gyroscope over pairs of samples, at the lag that fits best.
 
-    `attitude` gives quaternions (n, 4) of rows. None where there are too few of them.
+    Parameters
+    ----------
+    t
+        (N,) times of the tracker's valid attitudes, s from the IMU's first sample.
+    attitude
+        Takes indices (n,) to quaternions (n, 4), tool to reference.
+    imu
+        The IMU's samples.
+    most
+        Largest number of pairs, about.
+
+    Returns
+    -------
+    None if there are fewer than 40 pairs.
     """
     if len(t) < 2 or len(imu.time_ns) < 2:
         return None
@@ -138,12 +177,12 @@ def relative_rotations(
 
 
 def rotation_vectors(first: Floats, second: Floats) -> Floats:
-    """Rotation vectors (N, 3), in the body, that take one attitude (N, 4) to the next."""
+    """Rotation vectors (N, 3), rad, from attitudes `first` to `second` (N, 4), in the body frame."""
     return (to_scipy(first).inv() * to_scipy(second)).as_rotvec()
 
 
 def outlying_poses(q: Floats) -> Flags:
-    """Which attitudes (N, 4) are of another pose than those before and after, which are alike."""
+    """Mask (N,) of attitudes (N, 4) that differ from both neighbours while these agree with each other."""
     found = np.zeros(len(q), bool)
     if len(q) > 2:
         step = _angle(q[1:], q[:-1])
@@ -153,11 +192,13 @@ def outlying_poses(q: Floats) -> Flags:
 
 
 def _angle(a: Floats, b: Floats) -> Floats:
+    """Angle (N,), rad, between attitudes (N, 4)."""
     return 2.0 * np.arccos(np.minimum(np.abs(np.einsum("ni,ni->n", a, b)), 1.0))
 
 
 def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
-    """The lag at which both turn alike far, whatever their frames and units."""
+    """Lag, s, at which the rotation angles of both streams correlate best; independent of frames and
+    units."""
     few = slice(None, None, max(1, -(-len(size) // _SEARCHED)))
     begin, end = begin[few], end[few]
     # Wrong poses would outweigh all motion; where there is little of it, it is not to be cut short itself.
@@ -200,7 +241,13 @@ def best_lag(signals: Floats, delayed: Callable[[float], Floats], lags: Floats) 
 
 
 def fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
-    """Rotation (Wahba) and ratio from the gyroscope's turns (N, 3) to the tracker's, outlying_poses left out."""
+    """Rotation (Wahba's problem) and scale from gyroscope to tracker, the worst tenth left out.
+
+    Parameters
+    ----------
+    tracker, gyroscope
+        (N, 3) relative rotations, rad, as in `RelativeRotations`.
+    """
     size = np.linalg.norm(tracker, axis=1)
     weight = np.minimum(1.0, np.quantile(size, 0.95) / np.maximum(size, 1e-12))
     found = _motion_fit(tracker * weight[:, None], gyroscope * weight[:, None])
@@ -221,7 +268,7 @@ def _motion_fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
 def fit_readings(
     rotations: RelativeRotations, others: Mapping[str, QuaternionReading]
 ) -> dict[str, MotionFit]:
-    """The fit that each other reading of the quaternions would give."""
+    """The fit under each other reading of the quaternions, by the name of the reading."""
     return {
         name: fit(
             rotation_vectors(read(rotations.q_begin), read(rotations.q_end)), rotations.gyroscope
@@ -231,19 +278,20 @@ def fit_readings(
 
 
 def second_axis_share(vectors: Floats) -> float:
-    """How much there is about a second axis beside the first, in squares, 0 to 1."""
+    """Squared rotation about the second principal axis over that about the first, 0 to 1."""
     values = np.linalg.eigvalsh(vectors.T @ vectors)
     return float(values[1] / values[2]) if values[2] > 0.0 else 0.0
 
 
 class AccelerationFit(NamedTuple):
-    """How a tracker's path and the accelerometer's agree."""
+    """Agreement of the accelerations of a tracker and an accelerometer."""
 
-    rate_ratio: float
-    """Of the tracker's acceleration to the accelerometer's."""
+    ratio: float
+    """Acceleration of the tracker over that of the accelerometer."""
     correlation: float
+    """Correlation coefficient of the two, all axes together."""
     acceleration: float
-    """Root mean square of the tracker's, in its unit / s^2."""
+    """Root mean square of the tracker's acceleration, in its unit of length / s^2."""
 
 
 def acceleration_fit(
@@ -251,9 +299,21 @@ def acceleration_fit(
 ) -> AccelerationFit | None:
     """The tracker's second differences over 0.2 s against the accelerometer's double integral.
 
-    ``p(t + T) - 2 p(t) + p(t - T)`` is the integral of ``(T - |s|) a(t + s)``; gravity, which is constant,
-    leaves with the mean. `frame` (3, 3) takes vectors of the IMU into the tracked frame. None where there
-    is too little to compare.
+    ``p(t + T) - 2 p(t) + p(t - T)`` is the integral of ``(T - |s|) a(t + s)``; gravity is constant
+    and cancels with the mean.
+
+    Parameters
+    ----------
+    optical, imu
+        Streams with positions and specific forces.
+    lag_s
+        Lag to subtract from the tracker's time stamps, s.
+    frame
+        (3, 3) rotation matrix, IMU frame to tool frame.
+
+    Returns
+    -------
+    None if a stream lacks positions or specific forces, or if too few differences can be formed.
     """
     if optical.position is None or imu.accelerometer is None or len(imu.time_ns) < 2:
         return None
@@ -287,8 +347,10 @@ def acceleration_fit(
 
 
 def mean_force(rotations: RelativeRotations, imu: Imu, frame: Floats) -> Floats:
-    """Mean of the accelerometer's readings (3,) in the reference frame, m/s^2: opposite to free fall,
-    whatever the motion. NaN without an accelerometer."""
+    """Mean specific force (3,), m/s^2, in the reference frame, opposite to gravity whatever the motion.
+
+    Returns NaN without an accelerometer.
+    """
     if imu.accelerometer is None:
         return np.full(3, np.nan)
     integral = Integral(imu.time_ns, imu.accelerometer)

@@ -1,7 +1,9 @@
-"""How one clock and one frame lie to another, found from the angular rates that both streams tell.
+"""Time offset and rotation between a tracker and an IMU, from the angular rates that both measure.
 
-The tracker's turn from one sample to the next is the integral of the gyroscope's rate over the same time,
-in the same frame. What has to be added to the stamps, and how the frames lie, follows by least squares.
+The rotation of the tracker from sample to sample equals the integral of the gyroscope's rate over the same
+time, in the same frame. A coarse lag search by correlation needs no frames; Gauss-Newton then estimates
+latency, tracker-to-IMU rotation and gyroscope bias together. `attitude_alignment.refine` improves the
+result.
 """
 
 from dataclasses import dataclass
@@ -17,57 +19,75 @@ from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
 _LARGEST_S = 0.5
+"""Largest latency, s, that is accepted."""
 _LONGEST_GAP = 2.5
-"""Periods between two samples over which a turn still counts."""
+"""Sampling periods between two samples up to which a relative rotation is used."""
 _FEWEST = 50
+"""Fewest relative rotations."""
 _COARSE = 6000
-"""Turns among which the latency is searched for."""
+"""Relative rotations that the coarse search uses."""
 _OUTLIER_RATIO = 5.0
+"""Residuals larger than the median by this factor are outliers."""
 _ROUNDS = 12
 _CORRELATED = 8
 """Samples over which residuals are taken to be correlated."""
 _LARGEST_SIGMA_S = 0.005
+"""Largest accepted standard deviation of the latency, s."""
 _BLOCK_S, _LOCAL = 0.2, 20
-"""Seconds over which rates are compared, and blocks whose mean is taken off."""
+"""Seconds over which rates are compared, and blocks whose mean is subtracted."""
 _LARGEST_CORRELATION = 1.0 - 1e-9
 _SIGNIFICANT = 8.0
-"""Deviations that a correlation of noise does not reach, with lag and frame fitted to it."""
+"""Standard deviations that the correlation of pure noise, with lag and frame fitted to it, does not
+reach."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """How a tracker lies to an IMU in time and frame."""
+    """Time offset and rotation of a tracker relative to an IMU."""
 
     latency_s: float
-    """Seconds that the tracker's samples are older than stamped, by the IMU's clock."""
+    """Seconds by which the tracker's samples are older than stamped, on the IMU's clock."""
     latency_sigma_s: float
+    """Its standard deviation, s."""
     alignment: Floats
-    """(3,) rotation vector, rad, that takes vectors of the tracked frame into the IMU's, as
-    `calibration.alignment` of `loose_pose` and `tight` does: where the tracker's rate, in its own frame,
-    is ``exp(alignment)' (gyroscope - bias)``."""
+    """(3,) rotation vector, rad, from tool frame to IMU frame, as `calibration.alignment` of
+    `loose_pose` and `tight`: the tracker's rate, in the tool frame, is ``exp(alignment)' (gyroscope -
+    bias)``."""
     alignment_sigma: Floats
-    """(3,) rad: large about an axis where all turning was about that axis, too."""
+    """(3,) standard deviations, rad; large about an axis if all rotation was about that axis."""
     bias: Floats
-    """(3,) rad/s, of the gyroscope."""
+    """(3,) rad/s, gyroscope bias, IMU frame."""
     turns: int
-    """Turns from sample to sample that were used; outliers are not."""
+    """Relative rotations that were used, outliers excluded."""
 
 
 class _Rotations(NamedTuple):
-    """Turns of the tracker from sample to sample."""
+    """Rotations of the tracker from sample to sample."""
 
     begin: Floats
-    """(N,) seconds of the IMU's first sample on, as stamped."""
+    """(N,) s from the IMU's first sample, as stamped."""
     end: Floats
     turn: Floats
-    """(N, 3) rotation vectors, rad."""
+    """(N, 3) rotation vectors, rad, tool frame."""
 
 
 def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
-    """Latency of the tracker against the IMU, up to half a second, and how their frames lie.
+    """Latency of a tracker relative to an IMU, up to half a second, and the rotation between their frames.
 
-    Raises `RecordingError` where there are too few turns, so little motion that the latency is not known to
-    5 ms, or where it would be half a second or more: it is then refused, not guessed.
+    Parameters
+    ----------
+    optical
+        Attitudes of the tool.
+    imu
+        Rates of the IMU.
+    place
+        Name of the recording for error messages.
+
+    Raises
+    ------
+    RecordingError
+        If there are fewer than 50 relative rotations, if the motion determines the latency to no
+        better than 5 ms, or if the latency is half a second or more.
     """
     turns = _relative_rotations(optical, imu)
     if len(turns.turn) < _FEWEST:
@@ -75,7 +95,7 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
             str(place),
             f"{len(turns.turn)} pairs of tracker samples within the IMU's time",
             f"{_FEWEST} or more to match the clocks by",
-            "a longer recording, or one in which the tool is rows",
+            "a longer recording, or one in which the tool is visible",
         )
     seconds = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     steps = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * np.diff(seconds)[:, None]
@@ -86,26 +106,26 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
     if abs(found.latency_s) >= _LARGEST_S:
         raise RecordingError(
             str(place),
-            f"tracker and gyroscope that agree best {found.latency_s:+.2f} s apart",
+            f"a latency of {found.latency_s:+.2f} s between tracker and gyroscope",
             f"clocks within {_LARGEST_S:g} s of each other",
-            "shifting the times of one of them first",
+            "shifting the times of one stream first",
         )
     if not found.latency_sigma_s <= _LARGEST_SIGMA_S:
         raise RecordingError(
             str(place),
-            f"so little turning that the latency is known to {1e3 * found.latency_sigma_s:.0f} ms only",
+            f"too little rotation: the latency is known to {1e3 * found.latency_sigma_s:.0f} ms only",
             f"{1e3 * _LARGEST_SIGMA_S:.0f} ms or better",
-            "a recording in which the tool turns about several axes, faster and slower",
+            "a recording in which the tool rotates about several axes at varying speed",
         )
     _require_rate_changes(optical, imu, found, place)
     return found
 
 
 def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
-    """Both streams tell the same changes of rate, or the latency is that of noise.
+    """Raise `RecordingError` unless both streams share the same changes of rate.
 
-    Where the rate is constant, its changes are the gyroscope's noise, in which some lag always fits best,
-    and as sharply as if they were motion. Only what the tracker shares is.
+    At constant rate the only changes are the gyroscope's noise. Some lag always fits that noise best,
+    and as sharply as motion, so the changes must also be present in the tracker.
     """
     rows = np.flatnonzero(optical.valid)
     t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
@@ -125,22 +145,22 @@ def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: objec
     shared = float(np.sum(one * other))
     squares = float(np.sum(one**2) * np.sum(other**2))
     correlation = shared / np.sqrt(squares) if squares > 0.0 else 0.0
-    # Fisher's transform: of few blocks, too, a correlation near one is none of chance.
+    # Fisher's transform makes the bound right for few blocks, too.
     deviations = np.arctanh(
         np.clip(correlation, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
     ) * np.sqrt(max(one.size - 3, 1))
     if deviations < _SIGNIFICANT:
         raise RecordingError(
             str(place),
-            "so little turning faster and slower that tracker and gyroscope are alike by chance only"
+            "too little rotation of varying speed: tracker and gyroscope do not correlate"
             f" (correlation {correlation:.2f})",
             f"{np.tanh(_SIGNIFICANT / np.sqrt(max(one.size - 3, 1))):.2f} or more",
-            "a recording in which the tool turns about several axes, faster and slower",
+            "a recording in which the tool rotates about several axes at varying speed",
         )
 
 
 def _remove_local_mean(rates: Floats) -> Floats:
-    """Rates (N, 3) less the mean of those about them: no constant turning, no wandering bias."""
+    """Rates (N, 3) minus their local mean, which removes constant rotation and a drifting bias."""
     groups = np.arange(len(rates)) // _LOCAL
     count = np.bincount(groups)[:, None]
     total = np.stack([np.bincount(groups, rates[:, i]) for i in range(3)], axis=1)
@@ -160,12 +180,12 @@ def _relative_rotations(optical: Optical, imu: Imu) -> _Rotations:
 
 
 def _coarse_latency(turns: _Rotations, integral: CubicHermiteSpline, period_s: float) -> float:
-    """The latency at which both turn alike fast, whatever their frames: the best correlation."""
-    # Of a long run some are enough to tell so roughly.
+    """The latency, s, at which the rotation speeds correlate best; independent of the frames."""
+    # A subset is enough for a rough estimate.
     turns = _Rotations(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
     span = turns.end - turns.begin
     speed = np.linalg.norm(turns.turn, axis=1) / span
-    # A wrong pose is a spike of speed, which would outweigh all motion.
+    # A wrong pose is a spike of speed, which would dominate the correlation.
     speed = np.minimum(speed, np.quantile(speed, 0.98))
 
     def gyroscope_speed(lag: float) -> Floats:
@@ -178,7 +198,7 @@ def _coarse_latency(turns: _Rotations, integral: CubicHermiteSpline, period_s: f
 
 
 def _gauss_newton(turns: _Rotations, integral: CubicHermiteSpline, latency: float) -> Match:
-    """Latency, alignment and bias together by Gauss and Newton, wrong turns left out."""
+    """Latency, alignment and bias by Gauss-Newton, outliers left out."""
     rate = integral.derivative()
     span = turns.end - turns.begin
     integrated = integral(turns.end - latency) - integral(turns.begin - latency)
@@ -213,9 +233,9 @@ def _gauss_newton(turns: _Rotations, integral: CubicHermiteSpline, latency: floa
 
 
 def _robust_covariance(design: Floats, residual: Floats, kept: Flags) -> Floats:
-    """Covariance of a least-squares solution whose residuals are correlated over a few samples.
+    """Covariance of a least-squares solution with autocorrelated residuals (Newey-West).
 
-    The noise of a sample is in the turn to it and the turn from it, so that most of it cancels.
+    The noise of one sample enters two relative rotations with opposite sign, so most of it cancels.
     """
     score = np.einsum("nij,ni->nj", design, residual) * kept[:, None]
     middle = score.T @ score
@@ -224,7 +244,7 @@ def _robust_covariance(design: Floats, residual: Floats, kept: Flags) -> Floats:
         middle += (1.0 - lag / (_CORRELATED + 1.0)) * (cross + cross.T)
     flat = design[kept].reshape(-1, design.shape[2])
     inverse = np.linalg.pinv(flat.T @ flat)
-    # Where the noise cancels to nothing, and beyond, half of the naive variance is still claimed.
+    # Lower bound for the case that the correlated noise cancels almost completely.
     naive = inverse * float(np.sum(residual[kept] ** 2)) / max(flat.shape[0] - flat.shape[1], 1)
     cov = inverse @ middle @ inverse
     short = np.diagonal(cov) < 0.05 * np.diagonal(naive)

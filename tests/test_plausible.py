@@ -240,7 +240,7 @@ def test_gravity_the_other_way_round():
         optical=None,
         imu=replace(still.imu, accelerometer=np.tile(-fall, (len(run.imu.time_ns), 1))),
     )
-    for size, said in ((1.0 / STANDARD_GRAVITY, "free fall of 1 m/s"), (1e3, "free fall of 9.8")):
+    for size, said in ((1.0 / STANDARD_GRAVITY, "gravity of 1 m/s"), (1e3, "gravity of 9.8")):
         with pytest.raises(RecordingError, match=f"{said}.*about 9.8"):
             plausibility.require(still.replace(info={"gravity_ref": list(size * fall)}))
 

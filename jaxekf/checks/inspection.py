@@ -1,4 +1,7 @@
-"""What a recorded run holds and whether it can be used as it is: samples, gaps, clocks and units."""
+"""Inspection of a recorded run: samples, gaps, clocks, units, and whether it can be used as it is.
+
+`inspect` gathers the findings for `jaxekf check`; its verdict is ``fine``, ``warnings`` or ``faults``.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -31,21 +34,21 @@ _LONG_IMU_GAP_S = 0.5
 _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
 _SEEN_TOO_LITTLE = 0.5
 _EXPECTED = ("blank", "hidden", "missing tool", "status ")
-"""What begins so is masked in good recordings, too: the tool was hidden."""
+"""Reasons that occur in good recordings, too: the tool was hidden."""
 
 Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """Where nothing stands."""
+    """Gaps of a stream."""
 
     count: int
     longest_s: float
     lost_s: float
-    """Sum of the steps over the gaps."""
+    """Total length of the gaps, s."""
     spans: list[Span]
-    """Begin and end, seconds on the recording's clock."""
+    """Begin and end of each gap, s on the recording's clock."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -53,21 +56,21 @@ class Gaps:
 
 
 class StreamSummary(NamedTuple):
-    """One stream, or one marker of a tool."""
+    """Summary of one stream, or of one marker of a tool."""
 
     samples: int
     usable: int
     rate_hz: float
-    """By the median step; NaN of one sample."""
+    """Rate by the median step, Hz; NaN for one sample."""
     begin_s: float
-    """Seconds on the recording's clock, latency taken off."""
+    """First time, s on the recording's clock, latency subtracted."""
     end_s: float
     gaps: Gaps
-    """Steps of more than 1.5 times the median between the stamps of samples, usable or not."""
+    """Gaps between time stamps, of samples usable or not: steps of more than 1.5 times the median."""
     hidden: Gaps
-    """Stretches of samples that are there and not usable."""
+    """Intervals of samples that exist and are not usable."""
     masked: dict[str, int]
-    """Rows by reason; where none were read, samples that are not valid."""
+    """Masked rows by reason; samples that are not valid if no rows were read."""
     dropped: dict[str, int]
 
     def as_dict(self) -> dict[str, Any]:
@@ -82,31 +85,31 @@ class PointsSummary(NamedTuple):
     landmarks: int
     images: int
     points_per_image: float
-    """Usable ones, on average over all images."""
+    """Usable points, mean over all images."""
     images_without_points: int
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found of one run."""
+    """Findings on one run."""
 
     run: str
     streams: dict[str, StreamSummary]
     evidence: Evidence
     alignment: RunAlignment | None
-    """None where the run does not tell it, or has nothing to align."""
+    """None if it could not be estimated, or if there is nothing to align."""
     faults: tuple[str, ...] = ()
-    """What forbids using the run as it is."""
+    """Findings that forbid using the run as it is."""
     warnings: tuple[str, ...] = ()
-    """What should be looked at before."""
+    """Findings to look at before using the run."""
     notes: tuple[str, ...] = ()
-    """What is as it is in good runs, too."""
+    """Findings that occur in good runs, too."""
     markers: dict[str, StreamSummary] = field(default_factory=dict)
-    """Single markers by their names."""
+    """Single markers by name."""
     points: PointsSummary | None = None
     """None without a camera."""
     camera: CameraEvidence | None = None
-    """None also where no image has landmarks enough for a pose."""
+    """None without a camera, or if no image has landmarks enough for a pose."""
 
     @property
     def verdict(self) -> str:
@@ -115,7 +118,7 @@ class Inspection:
 
 
 def inspect(recording: Recording) -> Inspection:
-    """Look at a run; nothing that is found raises."""
+    """Inspect a run; a finding is reported and never raises."""
     streams = {
         label: _stream(recording, label)
         for label in STREAMS
@@ -141,12 +144,12 @@ def inspect(recording: Recording) -> Inspection:
         try:
             aligned = align_run(recording)
         except RecordingError as error:
-            warnings.append(f"clock and frame are not told: {error}")
+            warnings.append(f"clock and frame could not be estimated: {error}")
     for label in streams:
-        _accounted(recording, label, warnings, notes)
-    warnings += _of_time(streams, found)
-    warnings += [] if aligned is None else _of_clocks(aligned)
-    warnings += [] if faults else _of_units(recording, found)
+        _add_row_accounts(recording, label, warnings, notes)
+    warnings += _timing_warnings(streams, found)
+    warnings += [] if aligned is None else _clock_warnings(aligned)
+    warnings += [] if faults else _unit_warnings(recording, found)
     warnings += [] if faults or seen is None else camera_warnings(seen)
     return Inspection(
         recording.name,
@@ -176,7 +179,7 @@ def _stream(recording: Recording, label: str) -> StreamSummary:
         dropped = {name: reason.count for name, reason in account.dropped.items()}
     elif not usable.all():
         masked = {"not valid": int((~usable).sum())}
-    return _found(stream.time_ns - getattr(stream, "latency_ns", 0), usable, masked, dropped)
+    return _summary(stream.time_ns - getattr(stream, "latency_ns", 0), usable, masked, dropped)
 
 
 def _markers(recording: Recording) -> dict[str, StreamSummary]:
@@ -185,7 +188,7 @@ def _markers(recording: Recording) -> dict[str, StreamSummary]:
         return {}
     time_ns = markers.time_ns - markers.latency_ns
     return {
-        name: _found(time_ns, markers.usable[:, i], _hidden(markers.usable[:, i]), {})
+        name: _summary(time_ns, markers.usable[:, i], _masked_reason(markers.usable[:, i]), {})
         for i, name in enumerate(markers.names)
     }
 
@@ -200,11 +203,11 @@ def _points(recording: Recording) -> PointsSummary | None:
     )
 
 
-def _hidden(usable: Flags) -> dict[str, int]:
+def _masked_reason(usable: Flags) -> dict[str, int]:
     return {} if usable.all() else {"hidden": int((~usable).sum())}
 
 
-def _found(
+def _summary(
     time_ns: Times, usable: Flags, masked: dict[str, int], dropped: dict[str, int]
 ) -> StreamSummary:
     step = float(np.median(np.diff(time_ns))) / NANOSECONDS if len(time_ns) > 1 else np.nan
@@ -222,7 +225,7 @@ def _found(
 
 
 def find_gaps(time_ns: Times) -> Gaps:
-    """Steps of more than 1.5 times the median."""
+    """Gaps of a stream: steps of more than 1.5 times the median."""
     step = np.diff(time_ns)
     if step.size == 0:
         return Gaps(0, 0.0, 0.0, [])
@@ -231,7 +234,7 @@ def find_gaps(time_ns: Times) -> Gaps:
 
 
 def _stretches(time_ns: Times, bad: Flags) -> Gaps:
-    """Stretches of bad samples, each from its first to the next good one, or to the last."""
+    """Intervals of bad samples, each from its first to the next good one, or to the last."""
     edges = np.flatnonzero(np.diff(np.r_[False, bad, False].astype(int)))
     return _gaps(time_ns, edges[::2], np.minimum(edges[1::2], len(time_ns) - 1))
 
@@ -243,8 +246,10 @@ def _gaps(time_ns: Times, begin: Any, end: Any) -> Gaps:
     return Gaps(len(spans), float(lost.max(initial=0.0)), float(lost.sum()), spans)
 
 
-def _accounted(recording: Recording, label: str, warnings: list[str], notes: list[str]) -> None:
-    """What became of rows, in the words of their account: hidden tools are noted, all else is a warning."""
+def _add_row_accounts(
+    recording: Recording, label: str, warnings: list[str], notes: list[str]
+) -> None:
+    """Add the account of rows: hidden tools become notes, everything else warnings."""
     account = recording.intake.get(label)
     if account is None:
         return
@@ -254,14 +259,14 @@ def _accounted(recording: Recording, label: str, warnings: list[str], notes: lis
         (notes if name.startswith(_EXPECTED) else warnings).append(text)
 
 
-def _of_time(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
+def _timing_warnings(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
     warnings = []
     imu = streams.get("imu")
     long = [b - a for a, b in imu.gaps.spans if b - a > _LONG_IMU_GAP_S] if imu else []
     if long:
         warnings.append(
             f"the IMU has {len(long)} gaps of more than {_LONG_IMU_GAP_S:g} s, the longest of"
-            f" {max(long):.2f} s: what is estimated within is made up"
+            f" {max(long):.2f} s: estimates within a gap are not usable"
         )
     for label, name in (("optical", "tracker"), ("markers", "tracker"), ("camera", "camera")):
         seeing = streams.get(label)
@@ -279,33 +284,35 @@ def _of_time(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
     return warnings
 
 
-def _of_clocks(aligned: RunAlignment) -> list[str]:
-    made = aligned.tracker
+def _clock_warnings(aligned: RunAlignment) -> list[str]:
+    match = aligned.tracker
     warnings = list(aligned.notes)
-    if has_latency(made) and not has_drift(made):
+    if has_latency(match) and not has_drift(match):
         warnings.append(
-            f"the tracker's samples are {1e3 * made.latency_s:.1f} ms older than stamped, by the IMU's"
-            " clock: jaxekf align writes a calibration that makes it good"
+            f"the tracker's samples are {1e3 * match.latency_s:.1f} ms older than stamped, by the IMU's"
+            " clock: jaxekf align writes a calibration that corrects it"
         )
-    if (turned := misalignment_deg(made)) is not None:
+    if (misaligned := misalignment_deg(match)) is not None:
         warnings.append(
-            f"the tracked frame is turned by {turned[0]:.1f} deg against the IMU's: jaxekf align"
-            " writes a calibration that makes it good"
+            f"the tool frame is rotated by {misaligned[0]:.1f} deg relative to the IMU's: jaxekf align"
+            " writes a calibration that corrects it"
         )
     return warnings
 
 
-def _of_units(recording: Recording, found: Evidence) -> list[str]:
-    """Numbers that no unit explains, and are not what they should be."""
+def _unit_warnings(recording: Recording, found: Evidence) -> list[str]:
+    """Warnings on implausible values that no wrong unit explains."""
     warnings = []
     gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     at_rest = found.static_scatter < _GRAVITY_OFF
     if at_rest and abs(found.static_norm / max(gravity, 1e-9) - 1.0) > _GRAVITY_OFF:
         warnings.append(
-            f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest, where gravity is {gravity:.2f}"
+            f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest; gravity is {gravity:.2f}"
         )
     if abs(found.rate_ratio - 1.0) > _RATE_OFF:
-        warnings.append(f"the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker")
+        warnings.append(
+            f"the gyroscope rotates {found.rate_ratio:.3f} times as fast as the tracker"
+        )
     if found.farthest > FARTHEST_M:
         warnings.append(
             f"the tool is up to {found.farthest:.3g} m from the reference's origin: are these metres?"

@@ -1,6 +1,7 @@
-"""What tracker and IMU of a recording say of its units, the order of its quaternion and its time.
+"""Agreement of tracker and IMU of a recording: units, quaternion order, time.
 
-Measured, not judged: `plausible` judges. What the streams do not tell is NaN.
+`evidence` measures and does not judge; `plausibility` judges. A quantity that the streams do not determine
+is NaN.
 """
 
 from collections.abc import Mapping
@@ -26,9 +27,9 @@ from jaxekf.recordings.types import (
 )
 
 ALIKE = 0.8
-"""Correlation from which on a ratio is that of one motion."""
+"""Correlation from which on both streams measure the same motion, so that their ratio is meaningful."""
 EXPLAINED = 0.9
-"""Share of the turning that a right reading explains."""
+"""Share of the rotation that the right reading of a quaternion explains."""
 DEGREES = 180.0 / np.pi
 _WINDOWS, _QUIETEST = 200, 5
 _MARKER_PAIRS = 1500
@@ -38,42 +39,43 @@ _ORDERS = {"w,x,y,z": "x,y,z,w", "x,y,z,w": "w,x,y,z"}
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was measured of a recording; NaN for what it does not tell."""
+    """Measurements on a recording; NaN if the streams do not determine a quantity."""
 
     turns: int = 0
-    """RelativeRotations of the tracker that were compared with the gyroscope."""
+    """Relative rotations of the tracker that were compared with the gyroscope."""
     rate: float = np.nan
     """Root mean square rate of the tracker, rad/s."""
     second_axis: float = np.nan
-    """Turning about a second axis beside the first, by the gyroscope, in squares: 0 to 1."""
+    """Squared rotation about the second principal axis over that about the first, by the gyroscope: 0 to
+    1."""
     lag_s: float = np.nan
-    """At which both turn alike fast, to 5 ms; `alignment` tells it well."""
+    """Lag of the tracker to 5 ms, s; `jaxekf.calibration.alignment` estimates it precisely."""
     rate_ratio: float = np.nan
-    """The gyroscope's rate to the tracker's: 1, or 57.3 where deg/s were taken for rad/s."""
+    """Gyroscope's rate over tracker's rate: 1, or 57.3 if deg/s were taken for rad/s."""
     rate_correlation: float = np.nan
-    """Of the turns as vectors, in the order and direction of the quaternion that fits best."""
+    """Correlation of the rotation vectors, for the best reading of the quaternion."""
     explained: float = np.nan
-    """Share of the tracker's turning that the gyroscope explains, frames aligned."""
+    """Share of the tracker's squared rotation that the gyroscope explains, frames aligned."""
     readings: dict[str, MotionFit] = field(default_factory=dict)
-    """The same were the quaternion in another order, or of the other direction."""
+    """The same for other readings of the quaternion (component order or direction)."""
     static_norm: float = np.nan
-    """The accelerometer's in the quietest seconds, m/s^2."""
+    """Norm of the specific force in the quietest seconds, m/s^2."""
     static_scatter: float = np.nan
-    """Deviation of that norm over it."""
+    """Relative standard deviation of that norm."""
     mean_force_ref: tuple[float, ...] = (np.nan, np.nan, np.nan)
-    """Mean of the accelerometer's readings in the reference frame, m/s^2, of any motion."""
+    """Mean specific force in the reference frame, m/s^2, valid for any motion."""
     length_ratio: float = np.nan
-    """The tracker's acceleration to the accelerometer's, or the markers' distances to the geometry's."""
+    """Tracker's acceleration over the accelerometer's, or markers' distances over the geometry's."""
     length_correlation: float = np.nan
-    """1 for markers."""
+    """Correlation of the accelerations; 1 for markers."""
     acceleration: float = np.nan
-    """Root mean square of the tracker's over 0.2 s, m/s^2."""
+    """Root mean square of the tracker's acceleration over 0.2 s, m/s^2."""
     farthest: float = np.nan
-    """Distance of the tool from the reference's origin that 95 % of poses stay within, m."""
+    """95 % quantile of the tool's distance from the reference frame's origin, m."""
     ranges_s: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """First and last time of each stream, latency taken off, s."""
+    """First and last time of each stream, latency subtracted, s."""
     overlap_s: float = np.nan
-    """Of tracker and IMU; negative where one ends before the other begins."""
+    """Overlap of tracker and IMU, s; negative if one ends before the other begins."""
 
     @property
     def mean_force(self) -> float:
@@ -103,7 +105,7 @@ class Evidence:
 
 
 def evidence(recording: Recording) -> Evidence:
-    """What tracker and IMU of a run say of units, order and time; quick, for a run of any length."""
+    """Measure the agreement of tracker and IMU; fast for a run of any length."""
     tracker, imu = recording.optical or recording.markers, recording.imu
     measured: dict[str, Any] = {"ranges_s": _ranges(recording)}
     if imu is not None:
@@ -159,8 +161,10 @@ def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
 
 
 def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
-    """How long a stream and the IMU overlap; negative where one ends before the other begins, NaN where one
-    is not there."""
+    """Overlap of a stream and the IMU, s.
+
+    Negative if one ends before the other begins, NaN if one is missing.
+    """
     if label not in ranges_s or "imu" not in ranges_s:
         return np.nan
     one, other = ranges_s["imu"], ranges_s[label]
@@ -168,7 +172,7 @@ def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
 
 
 def tracker_label(recording: Recording) -> str:
-    """Which stream the tracker is."""
+    """Name of the tracker's stream."""
     return "optical" if recording.optical is not None else "markers"
 
 
@@ -193,7 +197,7 @@ def _seconds_since_imu_start(time_ns: Times, imu: Imu) -> Floats:
 
 
 def select_frames(markers: Markers, rows: Indices) -> Markers:
-    """Some frames of single markers, what is not usable hidden."""
+    """Some frames of single markers, unusable markers hidden."""
     return Markers(
         markers.time_ns[rows],
         markers.position[rows],
@@ -204,7 +208,7 @@ def select_frames(markers: Markers, rows: Indices) -> Markers:
 
 
 def _other_readings(recording: Recording) -> dict[str, motion_agreement.QuaternionReading]:
-    """What the quaternion may be instead, by the entry of `recording.toml` that would say so."""
+    """Other readings of the quaternion, by the entry of `recording.toml` that would state them."""
     about = recording.info.get("optical_about", {})
     stated_parts = [
         part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")
@@ -216,7 +220,7 @@ def _other_readings(recording: Recording) -> dict[str, motion_agreement.Quaterni
         f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
     }
     if order in _ORDERS:
-        # What was stated scalar first is scalar last: its numbers moved on by one; or the other way round.
+        # Stated scalar first, actually scalar last: the components are shifted by one; or the reverse.
         shift = 1 if order == "w,x,y,z" else -1
         sign = np.array([1.0, -1.0, -1.0, -1.0]) if direction == "reference to body" else 1.0
         found[f"{_ORDERS[order]}, {direction}"] = lambda q: np.roll(q * sign, shift, axis=1) * sign
@@ -224,8 +228,8 @@ def _other_readings(recording: Recording) -> dict[str, motion_agreement.Quaterni
 
 
 def static_norm(imu: Imu) -> tuple[float, float]:
-    """Median norm of the accelerometer's readings, m/s^2, in the seconds in which they scatter least, and
-    that norm's deviation over it."""
+    """Median norm of the specific force in the quietest seconds, m/s^2, and its relative standard
+    deviation."""
     if imu.accelerometer is None or len(imu.time_ns) < 2:
         return np.nan, np.nan
     span = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
@@ -241,7 +245,7 @@ def static_norm(imu: Imu) -> tuple[float, float]:
 
 
 def marker_ratio(markers: Markers) -> float:
-    """Median ratio of the distances between markers seen together to those of the geometry."""
+    """Median ratio of the markers' measured distances to those of the geometry."""
     rows = np.arange(0, len(markers.time_ns), max(1, -(-len(markers.time_ns) // _FRAMES)))
     usable, position = markers.usable[rows], markers.position[rows]
     ratios = []

@@ -1,4 +1,9 @@
-"""Pose of a rigid tool from single markers, and gravity from poses and an accelerometer, on the host."""
+"""Pose of a rigid tool from single markers, and gravity from poses and an accelerometer, on the host.
+
+`absolute_orientation` solves single frames, `fit_markers` checks them against the tool's geometry,
+`from_markers` returns them as a tracker's stream; `first_consistent_pose` and `gravity` prepare the start
+of a filter.
+"""
 
 from typing import NamedTuple
 
@@ -23,39 +28,45 @@ from jaxekf.recordings.types import (
 )
 
 START_FIT = 4.0
-"""A run does not start from a frame whose markers fit the tool this much worse than the median."""
+"""Factor over the median error: a run does not start from a frame with a larger one."""
 _LARGEST_MISFIT = 0.25
-"""Markers that lie off the tool by more than this share of its size are not those of the tool."""
+"""Share of the tool's size: a larger error means markers of another tool."""
 _START_S = 1.0
 _START_TURN = 6.0
 _LEAST_TURN = 1e-3
 _LARGEST_SPEED = 3.0
 _LEAST_MARKERS = 3
 _LEAST_SPREAD = 0.05
-"""Markers are on a line where they are this much flatter than long."""
+"""Ratio of width to length below which markers are collinear."""
 _LONGEST_STEP_S = 0.2
 _LEAST_GRAVITY_S = 0.5
 
 
 class MarkerPose(NamedTuple):
-    """Rigid fits of many frames."""
+    """Rigid-body poses of many frames."""
 
     q_ref_body: Floats
-    """(N, 4)."""
+    """(N, 4) unit quaternions, body to reference."""
     position: Floats
-    """(N, 3) metres: the body's origin in the reference frame."""
+    """(N, 3) metres, the body's origin in the reference frame."""
     error: Floats
-    """(N,) metres: root mean square distance of the markers from the fitted ones."""
+    """(N,) metres, root mean square distance of the markers from their fitted places."""
     valid: Flags
-    """(N,) False where fewer than three markers are seen, or all on a line; the rest is then the
+    """(N,) False if fewer than three markers are visible or all are collinear; the pose is then the
     identity."""
 
 
 def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> MarkerPose:
-    """The pose that takes markers from the body to where they are seen, least squares by SVD.
+    """Least-squares poses from markers (Arun, Huang, Blostein 1987; Kabsch 1976; never a reflection).
 
-    `p_body_marker` (M, 3), `position` (N, M, 3) in the reference frame, `usable` (N, M); metres
-    (Arun, Huang, Blostein 1987; Kabsch 1976, so that it is never a reflection).
+    Parameters
+    ----------
+    p_body_marker
+        (M, 3) metres, body frame.
+    position
+        (N, M, 3) metres, reference frame.
+    usable
+        (N, M) visible markers.
     """
     usable = usable & np.isfinite(position).all(axis=2)
     count = usable.sum(axis=1)
@@ -81,10 +92,15 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
 
 
 def fit_markers(markers: Markers, place: object) -> MarkerPose:
-    """The rigid fit of every frame; raises `RecordingError` where the markers are not those of the tool.
+    """The pose of every frame, checked against the tool's geometry.
 
-    Whatever noise there is, it is small beside the tool: a larger misfit is a wrong unit, wrong names,
+    Marker noise is small relative to the tool: a larger error means a wrong unit, wrong marker names,
     or the geometry of another tool.
+
+    Raises
+    ------
+    RecordingError
+        If the median error is above a quarter of the tool's size.
     """
     fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
     if not fit.valid.any():
@@ -94,7 +110,7 @@ def fit_markers(markers: Markers, place: object) -> MarkerPose:
     if off > _LARGEST_MISFIT * size:
         raise RecordingError(
             str(place),
-            f"markers that lie {off:.3g} m off a tool of {size:.3g} m, whatever its pose",
+            f"markers that are {off:.3g} m off a tool of {size:.3g} m in the best pose",
             f"at most {_LARGEST_MISFIT * size:.2g} m",
             "metres in markers.csv and in its geometry, and each marker under its own name",
         )
@@ -102,9 +118,14 @@ def fit_markers(markers: Markers, place: object) -> MarkerPose:
 
 
 def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
-    """The raw pose a tracker would report for its markers, frame by frame, without any filter.
+    """The pose that a tracker would report for its markers, frame by frame, without a filter.
 
-    `fit` is that of `fit_markers`, where it is known already.
+    Parameters
+    ----------
+    markers
+        Single markers.
+    fit
+        Result of `fit_markers`, if it is known.
     """
     if fit is None:
         fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
@@ -118,7 +139,10 @@ def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
 
 
 def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Floats:
-    """Velocity (3,), m/s, at the valid sample `first`, from the next one; 0 where that is too late."""
+    """Velocity (3,), m/s, at the valid sample `first`, by the difference to the next valid one.
+
+    It is zero if the next one is more than 0.2 s later.
+    """
     after = np.flatnonzero(valid[first + 1 :])
     if after.size == 0:
         return np.zeros(3)
@@ -130,11 +154,11 @@ def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Flo
 
 
 def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
-    """The valid pose to start from: the first of those of the first second that turns to the next as the
-    gyroscope did, and does not jump; where none does, the first of all. None where no pose is valid.
+    """Index of the first valid pose that agrees with the gyroscope and does not jump.
 
-    A tracker that has just found its tool may begin with a wrong pose, which no later one corrects for as
-    long as gates refuse what does not fit.
+    The search covers the first second; if no pose agrees, the first valid one is returned, and None
+    without any. A tracker that has just found its tool may begin with a wrong pose, which persists
+    for as long as gates refuse the samples that contradict it.
     """
     seen = np.flatnonzero(optical.valid)
     if seen.size == 0:
@@ -145,8 +169,8 @@ def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
     middle = (times[:-1] - times[0]) / NANOSECONDS + 0.5 * span
     rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
     turn = to_scipy(optical.q_ref_body[seen])
-    said = Rotation.from_rotvec(rate * span[:, None])
-    off = (said.inv() * turn[:-1].inv() * turn[1:]).magnitude()
+    measured = Rotation.from_rotvec(rate * span[:, None])
+    off = (measured.inv() * turn[:-1].inv() * turn[1:]).magnitude()
     near = span <= _LONGEST_STEP_S
     if not near.any():
         return int(seen[0])
@@ -160,11 +184,16 @@ def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
 
 
 def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
-    """Free fall (3,), m/s^2, in the reference frame: what the accelerometer measures besides motion.
+    """Gravity vector (3,), m/s^2, in the reference frame, from poses and specific forces.
 
-    Over every stretch with poses the mean of the accelerometer's readings, turned into the reference
-    frame, is the mean acceleration (the change of velocity) less gravity. The accelerometer's bias goes
-    into the answer as far as the tool did not turn. Raises `RecordingError` where poses are too few.
+    Over every stretch with poses the mean specific force, rotated into the reference frame, is the
+    mean acceleration (the change of velocity) minus gravity. The accelerometer's bias enters the
+    result as far as the tool did not rotate.
+
+    Raises
+    ------
+    RecordingError
+        If accelerometer or positions are missing, or if no stretch of half a second has poses.
     """
     if imu.accelerometer is None or optical.position is None:
         raise RecordingError(str(place), "no accelerometer", "one", "a run with ax, ay, az")
@@ -194,13 +223,13 @@ def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
             str(place),
             f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from",
             "one, or gravity_ref = [x, y, z] in recording.toml",
-            "stating free fall in the reference frame of the poses",
+            "stating the gravity vector in the reference frame of the poses",
         )
     return total / lasted
 
 
 def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[float, float]]:
-    """Velocities of straight lines fitted to both ends of a stretch, and the times they hold at."""
+    """Velocities of lines fitted to both ends of a stretch, and the times at which they are valid."""
     width = min(0.1, 0.4 * (t[-1] - t[0]))
     head, tail = t <= t[0] + width, t >= t[-1] - width
 

@@ -1,8 +1,7 @@
-"""Which way is up in the body, when it rests, and how the magnetic field lies to it, before any filter.
+"""Vertical, static intervals and magnetic field of an IMU, before any filter.
 
-From the samples up to an instant, but for what rest looks like and what the gyroscope reads then, which the
-whole run tells. What is found here says how far a magnetometer is to be trusted; no estimate takes an
-attitude from it.
+The functions use samples up to each instant, except for the noise and bias at rest, which come from the
+whole run. The results weight a magnetometer; no estimate takes its attitude from them.
 """
 
 from dataclasses import replace
@@ -24,20 +23,22 @@ from jaxekf.recordings.types import (
 )
 
 _SETTLING_S = 3.0
-"""Time constant of the low-pass in the frame that does not turn; accelerations of a hand average out."""
+"""Time constant, s, of the low-pass in the non-rotating frame, which averages out accelerations of a
+hand."""
 _STILL_S = 1.0
 _STILL_RATE, _STILL_FORCE = np.deg2rad(1.0), 0.3
-"""rad/s and m/s^2: more than any sensor scatters at rest."""
+"""Bounds on the noise of a static sensor, rad/s and m/s^2."""
 _QUIETEST, _LOUDER = 0.02, 1.6
-"""Share of the seconds that rest at least, and by how much a scatter at rest may exceed theirs."""
+"""Share of seconds that are static at least, and the factor over their scatter that is still static."""
 _LEAST = 0.05
-"""Share of what any sensor scatters that always is rest: readings may repeat to the last bit."""
+"""Share of those bounds below which samples are always static: readings may repeat exactly."""
 _SLOWEST_MEAN = np.deg2rad(2.0)
-"""rad/s: a gyroscope that reads more on average turns, whatever its scatter."""
+"""rad/s: a gyroscope with a larger mean rotates, whatever its scatter."""
 
 
 def integrated_attitude(imu: Imu) -> Floats:
-    """Quaternions (N, 4) that take the body at each sample to the body at the first, by gyroscope alone."""
+    """Quaternions (N, 4) from the body at each sample to the body at the first one, by the gyroscope
+    alone."""
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
     q = running_product(from_scipy(Rotation.from_rotvec(angle)))
@@ -45,10 +46,18 @@ def integrated_attitude(imu: Imu) -> Floats:
 
 
 def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
-    """Unit vectors (N, 3): the specific force, low-passed in a frame that does not turn, in the body.
+    """Unit vectors (N, 3) of the vertical in the body frame: specific force, low-passed in a
+    non-rotating frame.
 
-    The low-pass is of second order (Butterworth) and takes `settling_s` seconds. What the gyroscope reads
-    at rest is taken off, where the run rests: what is led on by a bias lags behind by degrees.
+    The gyroscope's bias at rest is subtracted if the run has static intervals; otherwise the frame
+    would drift and the result lag by degrees.
+
+    Parameters
+    ----------
+    imu
+        Samples with specific forces.
+    settling_s
+        Time constant of the second-order Butterworth low-pass, s.
     """
     # Slow to import, and every model is imported with this module.
     from scipy.signal import butter, sosfilt, sosfilt_zi
@@ -70,10 +79,10 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
 
 
 def static_samples(imu: Imu) -> Flags:
-    """(N,) whether the IMU has rested for the last second: readings scatter as little as they ever do.
+    """Mask (N,) of samples at the end of a static second: readings scatter as little as in the quietest
+    seconds.
 
-    What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise
-    is.
+    The scatter of the quietest seconds is limited to a sensor's possible noise.
     """
     width = max(2, int(_STILL_S * NANOSECONDS / max(period_ns(imu.time_ns), 1)))
     quiet = _quiet(imu.gyroscope, width, _STILL_RATE)
@@ -85,7 +94,7 @@ def static_samples(imu: Imu) -> Flags:
 
 
 class MagneticField(NamedTuple):
-    """The magnetic field as it is felt."""
+    """Magnetic field as measured."""
 
     norm: Floats
     """(N,) in the sensor's unit."""
@@ -94,10 +103,10 @@ class MagneticField(NamedTuple):
 
 
 def magnetic_field(imu: Imu) -> MagneticField:
-    """Norm and dip at each sample of a magnetometer; NaN where it was not read."""
+    """Norm and dip of the field at each sample of a magnetometer; NaN where it was not read."""
     assert imu.magnetometer is not None
     norm = np.linalg.norm(imu.magnetometer, axis=1)
-    # Some write zeros for what they did not read.
+    # Some loggers write zeros for missing readings.
     norm = np.where(np.isfinite(norm) & (norm > 0.0), norm, np.nan)
     with np.errstate(invalid="ignore"):
         down = -np.sum(imu.magnetometer * up_in_body(imu), axis=1) / norm
@@ -105,7 +114,8 @@ def magnetic_field(imu: Imu) -> MagneticField:
 
 
 def _quiet(values: Floats, width: int, most: float) -> Flags:
-    """Whether the last `width` of values (N, 3) scatter hardly more than the quietest, and below `most`."""
+    """Whether the last `width` of values (N, 3) scatter little more than the quietest, and less than
+    `most`."""
     values = values - values.mean(axis=0)
     spread = _trailing(values**2, width) - _trailing(values, width) ** 2
     deviation = np.sqrt(np.maximum(spread.max(axis=1), 0.0))
@@ -114,7 +124,7 @@ def _quiet(values: Floats, width: int, most: float) -> Flags:
 
 
 def _trailing(values: Floats, width: int) -> Floats:
-    """Mean of the last `width` values, fewer at the start."""
+    """Mean of the last `width` values, of fewer at the start."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - width, 0)

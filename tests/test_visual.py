@@ -305,7 +305,7 @@ def test_a_start_is_where_the_pose_is_known(monkeypatch):
     position, attitude = errors(made, run)
     assert position < 0.05
     assert attitude < np.deg2rad(0.5)
-    assert any("tells the pose well" in note for note in made.notes)
+    assert any("with a certain pose" in note for note in made.notes)
 
 
 def test_a_start_does_not_wait_for_the_best_image():

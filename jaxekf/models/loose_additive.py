@@ -1,13 +1,20 @@
-"""`loose_additive`: the filter of Cheng (2023) as published, its misprints mended.
+"""`loose_additive`: the filter of Cheng (2023), eqs. 1 to 17, as published, with misprints corrected.
 
-Ten numbers (quaternion, rate, bias), additive errors, the rate in the reference frame acting on the
-left, every stream held to the tracker's instants, eqs. 1 to 17. It is here to reproduce the paper and
-as the Euclidean case of the same core; use `loose` for work: the measured rate is taken as it is, so
-this model holds only while the axis of rotation is constant and the run starts at the identity.
+Choose it only to reproduce the paper; use `loose` for work. Errors are additive, the rate acts on the left
+in the reference frame, and every stream is held to the tracker's instants. The measured rate is used as it
+is, so the model is right only for a constant axis of rotation and a start at the identity.
 
-Mended: eq. 14 ends in ``q(k)``; eq. 15's identity is 4 x 4; eq. 17's first term divides by the squared
-rate (here by autodiff); the updated quaternion is normalised, and the sign of each measured one follows
-the predicted one.
+Corrections: eq. 14 ends in ``q(k)``; eq. 15's identity is 4 x 4; eq. 17's first term divides by the squared
+rate (here by autodiff); the updated quaternion is normalised, and the sign of each measured one follows the
+predicted one.
+
+- States (10): quaternion `q_ref_body`, `rate_ref` rad/s (reference frame), `bias` rad/s.
+- Input: none.
+- Sensors: `optical`, the quaternion (eq. 11); `gyroscope`, rate plus bias (eq. 12).
+- Noise: `quaternion` 1/sqrt(s), `acceleration` rad/s^2/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `optical` 1, `gyroscope` rad/s.
+- Calibration: none.
+- Initial: `quaternion` 1, `rate` rad/s, `bias` rad/s.
 """
 
 from collections.abc import Mapping
@@ -31,7 +38,7 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random. The paper's ``Q = T^2 Sigma_w``: a density here is ``sqrt(T Sigma_w)``."""
+    """Noise parameters. The paper's ``Q = T^2 Sigma_w``; a density here is ``sqrt(T Sigma_w)``."""
 
     quaternion: Any
     """Process noise of each quaternion component, spectral density; shape (), (4,) or (4, 4)."""
@@ -40,17 +47,17 @@ class Noise(NamedTuple):
     bias_walk: Any
     """Process noise of the bias, spectral density."""
     optical: Any
-    """Measured quaternion components, standard deviation of a sample; shape (), (4,) or (4, 4)."""
+    """Standard deviation of a sample's quaternion components; shape (), (4,) or (4, 4)."""
     gyroscope: Any
-    """Measured rate, standard deviation of a held sample."""
+    """Standard deviation of a held rate sample."""
 
 
 class Calibration(NamedTuple):
-    """This model has nothing to calibrate."""
+    """This model has no calibration parameters."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     quaternion: Any
     rate: Any
@@ -94,12 +101,12 @@ def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 
 def project(x: State) -> State:
-    """The updated quaternion back on the unit sphere, which an additive update leaves."""
+    """The updated quaternion normalised, as an additive update leaves the unit sphere."""
     return x._replace(q_ref_body=rotation.normalise(x.q_ref_body))
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude, the first measured rate, and no bias."""
+    """The first visible attitude, the first measured rate, and zero bias."""
     return State(*loose.first_values(first))
 
 
@@ -109,7 +116,7 @@ def initial_covariance(params: Parameters) -> Array:
 
 
 def rate_body(x: State, u: Any, params: Parameters) -> Array:
-    """The rate turned into the body frame, where the other models and the encoder give it."""
+    """The rate (3,) rotated into the body frame, in which other models and the encoder express it."""
     return rotation.rotate_inverse(x.q_ref_body, x.rate_ref)
 
 

@@ -1,9 +1,17 @@
 """`loose_rate`: attitude, angular rate and gyroscope bias, the gyroscope as a measurement.
 
-Cheng's (2023) state with an error-state attitude and body rates: 9 degrees of freedom. The rate is a
-random walk driven by a density of angular acceleration, so that smooth motion filters the
-gyroscope's own noise, which `loose` does not. That density says how the tool moves, which only the
-recordings know: tune it before use.
+Choose it for smooth motion with a noisy gyroscope, whose own noise it filters, unlike `loose`. Its density
+of angular acceleration describes the motion and must be tuned to the recordings first. The state is Cheng's
+(2023), with an error-state attitude and body rates instead of his eqs. 9 to 14.
+
+- States (9 degrees of freedom): attitude `q_ref_body` (error: rad, body frame), `rate` rad/s (body frame),
+  `bias` rad/s.
+- Input: none.
+- Sensors: `optical`, the tracker's attitude; `gyroscope`, rate plus bias.
+- Noise: `acceleration` rad/s^2/sqrt(Hz), `gyroscope` rad/s/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `optical` rad.
+- Calibration: none.
+- Initial: `attitude` rad, `rate` rad/s, `bias` rad/s.
 """
 
 from collections.abc import Mapping
@@ -13,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.model import Model, Output, Parameters, Sensor
 from jaxekf.geometry import linalg
 from jaxekf.geometry.manifold import SO3, Euclidean
@@ -28,24 +37,24 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     acceleration: Any
-    """Angular acceleration, spectral density: how fast the rate may change."""
+    """Angular acceleration, spectral density."""
     gyroscope: Any
     """White noise of the measured rate, spectral density."""
     bias_walk: Any
     """Random walk of the bias, spectral density of its derivative."""
     optical: Any
-    """The tracker's attitude, standard deviation of a sample, body frame."""
+    """Standard deviation of a sample of the tracker's attitude, body frame."""
 
 
 class Calibration(NamedTuple):
-    """This model has nothing to calibrate."""
+    """This model has no calibration parameters."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     attitude: Any
     rate: Any
@@ -73,17 +82,17 @@ def process_noise(params: Parameters, dt: Array) -> Array:
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
-    """Rate plus bias."""
+    """Rate plus bias (3,), rad/s."""
     return x.rate + x.bias
 
 
 def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
-    """Covariance (3, 3) of a gyroscope sample that averages over its own period ``dt``."""
+    """Covariance (3, 3) of a gyroscope sample that is the mean over its sampling period ``dt``."""
     return linalg.covariance(params.noise.gyroscope, 3) / dt
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude, the first measured rate, and no bias."""
+    """The first visible attitude, the first measured rate, and zero bias."""
     return State(*loose.first_values(first))
 
 
@@ -133,3 +142,6 @@ MODEL = Model(
         Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
     ),
 )
+
+
+__getattr__ = renamed(__name__, {"initial_covariance": "jaxekf.models.inertial:initial_covariance"})

@@ -225,7 +225,7 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
     elif found.turns:
         lines.append("rate: too little turning, or too unlike, to tell the gyroscope's unit")
     if found.readings and tracker == "tracker":
-        others = max(made.share for made in found.readings.values())
+        others = max(made.explained for made in found.readings.values())
         lines.append(
             f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"
             f" another order or direction {100.0 * others:.1f} %"

@@ -87,7 +87,7 @@ def test_planted_densities_are_found():
     for truth, made in ((white, [f.white for f in found]), (walk, [f.walk for f in found])):
         assert np.mean([m.value for m in made]) == pytest.approx(truth, rel=0.1)
         assert 0.90 <= np.mean([m.low <= truth <= m.high for m in made]) <= 0.99
-    assert np.mean([f.walk.found for f in found]) > 0.9
+    assert np.mean([f.walk.significant for f in found]) > 0.9
     assert np.mean([f.flicker > 0.0 for f in found]) < 0.05
     assert np.median([f.deviation(np.ones(1))[0] for f in found]) == pytest.approx(
         np.sqrt(white**2 + walk**2 / 3.0), rel=0.05
@@ -107,8 +107,8 @@ def test_flicker_is_told_from_a_walk():
     found = fit(values + samples(6, count, 0.2, 0.0), PERIOD_S)
     assert found.flicker == pytest.approx(1.0, rel=0.12)
     assert found.white.value == pytest.approx(0.2, rel=0.1)
-    assert not found.walk.found or found.walk.value < 0.1 * found.walk_alone.value
-    assert found.walk_alone.found
+    assert not found.walk.significant or found.walk.value < 0.1 * found.walk_alone.value
+    assert found.walk_alone.significant
 
 
 def test_low_pass_and_vibration_do_not_count():

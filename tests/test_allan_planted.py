@@ -67,7 +67,7 @@ def test_planted_walks_are_found(name):
     ):
         assert np.median([m.value for m in made]) == pytest.approx(truth, rel=within)
         assert sum(m.low <= truth <= m.high for m in made) >= fewest
-        assert all(m.found for m in made)
+        assert all(m.significant for m in made)
         if LONG:
             half = np.mean([np.log(m.high / m.low) for m in made]) / 2.0
             assert half == pytest.approx(1.96 * np.std([np.log(m.value) for m in made]), rel=0.35)

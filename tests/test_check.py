@@ -181,7 +181,7 @@ CAMERA_FAULTS = {
     ),
     "images of half the size": (
         lambda c: {"pixel": 0.5 * c.pixel},
-        "of the camera's turning: are both of one run",
+        "of the camera's rotation: are both of one run",
         "warnings",
     ),
     "late": (lambda c: {"time_ns": c.time_ns + 40_000_000}, "the images are 40.", "warnings"),

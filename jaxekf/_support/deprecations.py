@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -164,16 +164,17 @@ def keep_old_names() -> None:
         sys.meta_path.insert(0, _OldNames())  # pyright: ignore[reportArgumentType]
 
 
-def renamed(module: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+def renamed(module: str, names: str) -> Callable[[str], Any]:
     """``__getattr__`` of `module` that finds its old names.
 
-    `names` gives for each old name the present one, or "module:name" where it left the module.
+    `names` are "old>new", or "old>package.module.new" if the name left the module, separated by blanks.
     """
+    places = dict(entry.split(">") for entry in names.split())
 
     def __getattr__(name: str) -> Any:
-        if name not in names:
+        if name not in places:
             raise AttributeError(f"module '{module}' has no attribute '{name}'", name=name)
-        home, _, new = names[name].rpartition(":")
+        home, _, new = places[name].rpartition(".")
         warnings.warn(
             f"{module}.{name} is now {home or module}.{new}; the old name will be gone in the next release",
             DeprecationWarning,

@@ -252,11 +252,6 @@ def _with(model: Model, changes: dict[str, Any]) -> Parameters:
 
 __getattr__ = renamed(
     __name__,
-    {
-        "Together": "CombinedAlignment",
-        "drifts": "has_drift",
-        "is_late": "has_latency",
-        "together": "combine_runs",
-        "turned_deg": "misalignment_deg",
-    },
+    "Together>CombinedAlignment drifts>has_drift is_late>has_latency together>combine_runs "
+    "turned_deg>misalignment_deg",
 )

@@ -130,9 +130,8 @@ def sensor_noise(values: Floats, period_s: float, unit: str) -> SensorNoise:
         ],
         axis=1,
     )
-    low = found * np.sqrt(freedom / chi_square.ppf(0.975, freedom))
-    high = found * np.sqrt(freedom / chi_square.ppf(0.025, freedom))
-    return SensorNoise(unit, Curve(tau, found, low, high), (x, y, z))
+    interval = chi_square.deviation_interval(found, freedom)
+    return SensorNoise(unit, Curve(tau, found, *interval), (x, y, z))
 
 
 def averaging_lengths(count: int) -> Floats:

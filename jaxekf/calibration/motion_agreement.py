@@ -375,17 +375,8 @@ def _fit_accelerations(acceleration: Floats, force: Floats) -> AccelerationFit:
 
 __getattr__ = renamed(
     __name__,
-    {
-        "Distance": "AccelerationFit",
-        "Fit": "MotionFit",
-        "Reading": "QuaternionReading",
-        "Turns": "RelativeRotations",
-        "distance": "acceleration_fit",
-        "pairs_of": "sample_pairs",
-        "readings": "fit_readings",
-        "second_axis": "second_axis_share",
-        "strays": "outlying_poses",
-        "turn_between": "rotation_vectors",
-        "turns": "relative_rotations",
-    },
+    "Distance>AccelerationFit Fit>MotionFit Reading>QuaternionReading Turns>RelativeRotations "
+    "distance>acceleration_fit pairs_of>sample_pairs readings>fit_readings "
+    "second_axis>second_axis_share strays>outlying_poses turn_between>rotation_vectors "
+    "turns>relative_rotations",
 )

@@ -287,9 +287,4 @@ def _misfit(lines: _Lines, variance: Floats) -> float:
     return float(off.mean())
 
 
-__getattr__ = renamed(
-    __name__,
-    {
-        "Estimated": "Coefficient",
-    },
-)
+__getattr__ = renamed(__name__, "Estimated>Coefficient")

@@ -210,8 +210,7 @@ def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter
     whole = np.median(np.abs(np.concatenate(about)), axis=0) / _MEDIAN
     return Scatter(
         found,
-        found * np.sqrt(freedom / chi_square.ppf(0.975, freedom)),
-        found * np.sqrt(freedom / chi_square.ppf(0.025, freedom)),
+        *chi_square.deviation_interval(found, freedom),
         len(step),
         float(np.max(whole / np.maximum(found, 1e-15))),
     )

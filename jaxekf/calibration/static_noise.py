@@ -250,9 +250,4 @@ def write_curve(path: Path, found: StaticNoise) -> None:
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")
 
 
-__getattr__ = renamed(
-    __name__,
-    {
-        "Start": "NoiseStart",
-    },
-)
+__getattr__ = renamed(__name__, "Start>NoiseStart")

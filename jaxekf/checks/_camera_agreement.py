@@ -16,8 +16,9 @@ from jaxekf.checks.plausibility import (
     FARTHEST_M,
     LEAST_RATE,
     check_gravity,
-    fault,
+    length_fault,
     path_unit,
+    rate_fault,
     rates_unit,
 )
 from jaxekf.checks.sensor_agreement import ALIKE, Evidence, evidence
@@ -123,25 +124,14 @@ def check_camera(recording: Recording, found: CameraEvidence) -> None:
     imu = found.imu
     unit = rates_unit(imu)
     if unit is not None:
-        raise fault(
-            recording,
-            "imu.unit",
-            f"a gyroscope that rotates {imu.rate_ratio:.4g} times as fast as the camera (correlation"
-            f" {imu.rate_correlation:.2f})",
-            "the same rate",
-            f'[imu] unit = "{unit}, m/s^2", the accelerometer\'s as it is',
+        raise rate_fault(
+            recording, imu, "camera", f'"{unit}, m/s^2", the accelerometer\'s as it is'
         )
     check_gravity(recording, imu)
     unit = path_unit(imu)
     if unit is not None:
-        raise fault(
-            recording,
-            "camera.unit",
-            f"a camera that moves {imu.length_ratio:.4g} times as far as the accelerometer (correlation"
-            f" {imu.length_correlation:.2f})",
-            "the same way",
-            f'[camera] unit = "{unit}, px", that of the landmarks\' places',
-        )
+        hint = f'"{unit}, px", that of the landmarks\' positions'
+        raise length_fault(recording, imu, "camera", hint)
 
 
 def camera_warnings(found: CameraEvidence) -> list[str]:

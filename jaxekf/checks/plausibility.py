@@ -62,13 +62,8 @@ def check(recording: Recording, found: Evidence) -> None:
     force = _force_unit(recording, found)
     rate = rates_unit(found)
     if rate is not None:
-        raise fault(
-            recording,
-            "imu.unit",
-            f"a gyroscope that rotates {found.rate_ratio:.4g} times as fast as the tracker (correlation"
-            f" {found.rate_correlation:.2f})",
-            "the same rate",
-            f'[imu] unit = "{rate}, {"m/s^2" if force is None else force[0]}"',
+        raise rate_fault(
+            recording, found, "tracker", f'"{rate}, {"m/s^2" if force is None else force[0]}"'
         )
     if force is not None:
         raise force[1]
@@ -82,6 +77,22 @@ def rates_unit(found: Evidence) -> str | None:
     if not (found.rate > LEAST_RATE and found.rate_correlation > ALIKE):
         return None
     return _unit(found.rate_ratio, DEGREES, _CLOSE, ("deg/s", "rad/s"))
+
+
+def rate_fault(recording: Recording, found: Evidence, reference: str, unit: str) -> RecordingError:
+    """The error about the gyroscope's unit: the rate of `reference` is another one."""
+    got = f"a gyroscope that rotates {found.rate_ratio:.4g} times as fast as the {reference}"
+    correlation = f" (correlation {found.rate_correlation:.2f})"
+    return fault(recording, "imu.unit", got + correlation, "the same rate", f"[imu] unit = {unit}")
+
+
+def length_fault(recording: Recording, found: Evidence, stream: str, unit: str) -> RecordingError:
+    """The error about the unit of positions of the stream ``optical`` or ``camera``."""
+    name = "tracker" if stream == "optical" else stream
+    got = f"a {name} that moves {found.length_ratio:.4g} times as far as the accelerometer"
+    correlation = f" (correlation {found.length_correlation:.2f})"
+    hint = f"[{stream}] unit = {unit}"
+    return fault(recording, f"{stream}.unit", got + correlation, "the same distance", hint)
 
 
 def path_unit(found: Evidence) -> str | None:
@@ -168,27 +179,12 @@ def _check_length(recording: Recording, found: Evidence) -> None:
         if unit is None:
             return
         stated = recording.info.get("markers_about", {}).get("unit", "m")
-        hint = f'[markers] unit = "{unit}"'
-        if stated == unit:
-            hint = "[markers.geometry] in metres"
-        raise fault(
-            recording,
-            "markers.unit",
-            f"markers {found.length_ratio:.4g} times as far apart as in the geometry",
-            "the same distances",
-            hint,
-        )
+        hint = "[markers.geometry] in metres" if stated == unit else f'[markers] unit = "{unit}"'
+        got = f"markers {found.length_ratio:.4g} times as far apart as in the geometry"
+        raise fault(recording, "markers.unit", got, "the same distances", hint)
     unit = path_unit(found)
-    if unit is None:
-        return
-    raise fault(
-        recording,
-        "optical.unit",
-        f"a tracker that moves {found.length_ratio:.4g} times as far as the accelerometer (correlation"
-        f" {found.length_correlation:.2f})",
-        "the same way",
-        f'[optical] unit = "1, {unit}"',
-    )
+    if unit is not None:
+        raise length_fault(recording, found, "optical", f'"1, {unit}"')
 
 
 def _check_order(recording: Recording, found: Evidence) -> None:

@@ -299,9 +299,5 @@ def summary_line(about: str, squares: Consistency) -> str:
 
 __getattr__ = renamed(
     __name__,
-    {
-        "in_order": "summary_line",
-        "named_faults": "significant_faults",
-        "too_few": "insufficient_samples",
-    },
+    "in_order>summary_line named_faults>significant_faults too_few>insufficient_samples",
 )

@@ -6,6 +6,7 @@ axes are *lanes*: independent problems, usually runs, next to each other in memo
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -90,6 +91,19 @@ def block_diagonal(blocks: Sequence[Array]) -> Array:
             for i, row in enumerate(blocks)
         ]
     )
+
+
+def block_covariance(deviations: Sequence[Any], dims: Sequence[int] | None = None) -> Array:
+    """Block-diagonal covariance of independent noise parameters, of three axes each or of `dims`."""
+    dims = dims or (3,) * len(deviations)
+    return block_diagonal([covariance(d, dim) for d, dim in zip(deviations, dims, strict=True)])
+
+
+def adjugate(matrix: Array) -> tuple[Array, Array]:
+    """Adjugate (3, 3) and determinant () of a matrix (3, 3): the inverse is their ratio."""
+    a, b, c = matrix
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+    return rows, jnp.sum(a * rows[:, 0])
 
 
 def mask_covariance(matrix: Array, mask: Array) -> Array:

@@ -24,9 +24,9 @@ class Lens(NamedTuple):
     r``."""
 
 
-def stretch(radial: Array, point: Array) -> Array:
-    """Radial distortion factor () of a point (2,) in focal lengths."""
-    r2 = jnp.sum(point * point)
+def stretch(radial: Any, point: Any) -> Any:
+    """Radial distortion factor (...) of points (..., 2) in focal lengths, in JAX or NumPy."""
+    r2 = (point * point).sum(axis=-1)
     return 1.0 + (radial[0] + radial[1] * r2) * r2
 
 

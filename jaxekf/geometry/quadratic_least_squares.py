@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf.geometry.linalg import multiply
+from jaxekf.geometry.linalg import adjugate, multiply
 
 # A direction in which the Jacobian is below this part of its size counts as undetermined.
 WEAK = 1e-7
@@ -104,9 +104,7 @@ def orthogonalise(matrix: Array, right: Array) -> Factors:
 
 def _inverse_or_identity(matrix: Array) -> Array:
     """Inverse (3, 3) by cofactors; the identity if the matrix is nearly singular."""
-    a, b, c = matrix
-    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-    determinant = jnp.sum(a * rows[:, 0])
+    rows, determinant = adjugate(matrix)
     good = jnp.abs(determinant) > 1e-9
     scaled = rows / jnp.where(good, determinant, 1.0)
     return jnp.where(good, scaled, jnp.eye(3, dtype=matrix.dtype))

@@ -91,7 +91,7 @@ def q_method_covariance(
     noise = jnp.sum((share * share * variances)[:, None, None] * across, axis=0)
     # Its eigenvalues add up to 2 and none exceeds 1: the determinant is about the smallest, which is
     # half the gap of `q_method`.
-    valid = 2.0 * _determinant(information) > default_threshold(least_gap, b.dtype)
+    valid = 2.0 * linalg.adjugate(information)[1] > default_threshold(least_gap, b.dtype)
     inverse = _inverse(jnp.where(valid, information, jnp.eye(3, dtype=b.dtype)))
     return jnp.where(valid, linalg.congruence(inverse, noise), jnp.eye(3, dtype=b.dtype))
 
@@ -156,15 +156,7 @@ def _with_derivatives(q: Array, profile: Array) -> Array:
     return q
 
 
-def _cofactors(matrix: Array) -> Array:
-    a, b, c = matrix
-    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-
-
-def _determinant(matrix: Array) -> Array:
-    return jnp.sum(matrix[0] * _cofactors(matrix)[0])
-
-
 def _inverse(matrix: Array) -> Array:
     """Inverse (3, 3), without a call to LAPACK."""
-    return _cofactors(matrix).T / _determinant(matrix)
+    adjugate, determinant = linalg.adjugate(matrix)
+    return adjugate / determinant

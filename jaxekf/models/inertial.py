@@ -26,6 +26,7 @@ from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Output, Parameters
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.models import _outputs
 from jaxekf.pose_solvers import marker_pose
 from jaxekf.recordings.types import Floats, Optical, Recording
 
@@ -83,9 +84,9 @@ class Setup(NamedTuple):
 
 
 SPACE: Any = State(
-    Euclidean(3, "m", frame="reference"),
+    _outputs.METRES,
     SO3(),
-    Euclidean(3, "m/s", frame="reference"),
+    _outputs.METRES_PER_SECOND,
     Euclidean(3, "rad/s"),
     Euclidean(3, "m/s^2"),
 )
@@ -139,13 +140,14 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (12, 12) of angle, velocity and bias noise over ``dt``, in the IMU's axes."""
     noise = params.noise
-    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
-    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * linalg.block_covariance(
+        (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
+    )
 
 
 def initial_covariance(params: Parameters) -> Array:
     """Covariance (3n, 3n) of n independent parts of three components each."""
-    return linalg.block_diagonal([linalg.covariance(d, 3) for d in params.initial])
+    return linalg.block_covariance(params.initial)
 
 
 def initial_mean(first: Any) -> State:
@@ -217,29 +219,18 @@ def _object_velocity_noise(u: InputSample, params: Parameters) -> Array:
 
 __getattr__ = renamed(
     __name__,
-    {
-        "STANDARD_GRAVITY": "GRAVITY_REF",
-        "block_diagonal": "jaxekf.geometry.linalg:block_diagonal",
-    },
+    "STANDARD_GRAVITY>GRAVITY_REF block_diagonal>jaxekf.geometry.linalg.block_diagonal",
 )
 
-_IN_REFERENCE = Euclidean(3, "m", frame="reference")
-_SPEED = Euclidean(3, "m/s", frame="reference")
 
 OUTPUTS = (
-    Output("position", _IN_REFERENCE, "reference", lambda x, u, params: x.position),
-    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-    Output("velocity", _SPEED, "reference", lambda x, u, params: x.velocity),
-    Output(
-        "rate",
-        Euclidean(3, "rad/s"),
-        "body",
-        lambda x, u, params: _rate(x, u.value, params),
-        rate_noise,
-    ),
+    _outputs.POSITION,
+    _outputs.ATTITUDE,
+    _outputs.VELOCITY,
+    _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
     Output(
         "object_position",
-        _IN_REFERENCE,
+        _outputs.METRES,
         "reference",
         lambda x, u, params: x.position + rotation.rotate(x.q_ref_body, params.setup.p_body_object),
     ),
@@ -249,5 +240,11 @@ OUTPUTS = (
         "object",
         lambda x, u, params: rotation.product(x.q_ref_body, params.setup.q_body_object),
     ),
-    Output("object_velocity", _SPEED, "reference", _object_velocity, _object_velocity_noise),
+    Output(
+        "object_velocity",
+        _outputs.METRES_PER_SECOND,
+        "reference",
+        _object_velocity,
+        _object_velocity_noise,
+    ),
 )

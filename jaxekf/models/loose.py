@@ -23,10 +23,10 @@ from jax import Array
 
 from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import inertial, sources
+from jaxekf.models import _outputs, inertial, sources
 
 
 class State(NamedTuple):
@@ -185,16 +185,10 @@ MODEL = Model(
         lambda params: params.calibration.clock_drift,
     ),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
-            lambda x, u, params: _rate(x, u.value, params),
-            rate_noise,
-        ),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
     ),
 )
 
 
-__getattr__ = renamed(__name__, {"initial_covariance": "jaxekf.models.inertial:initial_covariance"})
+__getattr__ = renamed(__name__, "initial_covariance>jaxekf.models.inertial.initial_covariance")

@@ -23,10 +23,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax import Array
 
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
-from jaxekf.geometry.manifold import SO3, AdditiveQuaternion, Euclidean
-from jaxekf.models import loose, sources
+from jaxekf.geometry.manifold import AdditiveQuaternion, Euclidean
+from jaxekf.models import _outputs, loose, sources
 
 
 class State(NamedTuple):
@@ -73,16 +73,11 @@ def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> Sta
     return State(turned + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
 
 
-def _block_diagonal(leaves: tuple[Any, Any, Any]) -> Array:
-    return linalg.block_diagonal(
-        [linalg.covariance(leaf, dim) for leaf, dim in zip(leaves, (4, 3, 3), strict=True)]
-    )
-
-
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (10, 10), ``Gamma Sigma_w Gamma'`` with ``Gamma = T I``, written in densities."""
     noise = params.noise
-    return _block_diagonal((noise.quaternion, noise.acceleration, noise.bias_walk)) * dt
+    densities = (noise.quaternion, noise.acceleration, noise.bias_walk)
+    return linalg.block_covariance(densities, (4, 3, 3)) * dt
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
@@ -112,7 +107,7 @@ def initial_mean(first: Mapping[str, Any]) -> State:
 
 def initial_covariance(params: Parameters) -> Array:
     """Covariance (10, 10)."""
-    return _block_diagonal(tuple(params.initial))
+    return linalg.block_covariance(params.initial, (4, 3, 3))
 
 
 def rate_body(x: State, u: Any, params: Parameters) -> Array:
@@ -167,8 +162,8 @@ MODEL = Model(
     initial_covariance=initial_covariance,
     start_with=("optical",),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output("rate", Euclidean(3, "rad/s"), "body", rate_body),
+        _outputs.ATTITUDE,
+        _outputs.rate(rate_body),
     ),
     project=project,
     hold_to="optical",

@@ -22,10 +22,10 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support.deprecations import renamed
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import inertial, loose, sources
+from jaxekf.models import _outputs, inertial, loose, sources
 
 
 class State(NamedTuple):
@@ -138,10 +138,10 @@ MODEL = Model(
     initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: x.rate),
     ),
 )
 
 
-__getattr__ = renamed(__name__, {"initial_covariance": "jaxekf.models.inertial:initial_covariance"})
+__getattr__ = renamed(__name__, "initial_covariance>jaxekf.models.inertial.initial_covariance")

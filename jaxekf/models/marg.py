@@ -30,11 +30,11 @@ import numpy as np
 from jax import Array
 
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor, Start
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import _earth as earth
-from jaxekf.models import inertial, sources
+from jaxekf.models import _outputs, inertial, sources
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import NANOSECONDS, Recording, Samples
 
@@ -137,8 +137,7 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (9, 9) of angle, velocity and bias noise over ``dt``."""
     noise = params.noise
-    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk)
-    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * linalg.block_covariance((noise.gyroscope, noise.accelerometer, noise.bias_walk))
 
 
 def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
@@ -308,13 +307,7 @@ MODEL = Model(
     setup=earth.setup,
     input=Input("imu", sources.imu, lambda params: params.calibration.clock_offset),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
-            lambda x, u, params: body_rate(x, u.value, params),
-            rate_noise,
-        ),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: body_rate(x, u.value, params), rate_noise),
     ),
 )

@@ -73,4 +73,4 @@ def rotated_to_reference(q_ref_body: Floats, vector: Floats) -> Floats:
     return to_scipy(q_ref_body).apply(vector)
 
 
-__getattr__ = renamed(__name__, {"turned": "rotated_to_reference"})
+__getattr__ = renamed(__name__, "turned>rotated_to_reference")

@@ -25,11 +25,11 @@ from jax import Array
 
 from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor
 from jaxekf.geometry import linalg, triad
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import _earth as earth
-from jaxekf.models import inertial, loose, sources
+from jaxekf.models import _outputs, inertial, loose, sources
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import Recording, Samples
 
@@ -165,11 +165,8 @@ MODEL = Model(
     start_with=("attitude",),
     input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
+        _outputs.ATTITUDE,
+        _outputs.rate(
             lambda x, u, params: u.value - x.bias,
             lambda u, params: linalg.covariance(params.noise.rate, 3) * u.bandwidth,
         ),

@@ -32,12 +32,12 @@ from jax import Array
 
 from jaxekf._support.constants import GRAVITY_REF
 from jaxekf._support.deprecations import renamed
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor, repeated
+from jaxekf.filtering.model import Model, Parameters, Sensor, repeated
 from jaxekf.geometry import linalg, pinhole, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.geometry.pinhole import Lens
 from jaxekf.models import _correspondences as correspondences
-from jaxekf.models import inertial, sources
+from jaxekf.models import _outputs, inertial, sources
 from jaxekf.models._correspondences import BilinearPoint, Point
 from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.types import Recording, Samples
@@ -153,13 +153,9 @@ def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> Sta
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (12, 12) of the changes of acceleration, rate, and both biases over ``dt``."""
     noise = params.noise
-    densities = (
-        noise.jerk,
-        noise.angular_acceleration,
-        noise.bias_walk,
-        noise.accelerometer_walk,
+    return dt * linalg.block_covariance(
+        (noise.jerk, noise.angular_acceleration, noise.bias_walk, noise.accelerometer_walk)
     )
-    return dt * linalg.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
@@ -316,20 +312,10 @@ UNITS = Parameters(
 )
 
 OUTPUTS = (
-    Output(
-        "position",
-        Euclidean(3, "m", frame="reference"),
-        "reference",
-        lambda x, u, params: x.position,
-    ),
-    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-    Output(
-        "velocity",
-        Euclidean(3, "m/s", frame="reference"),
-        "reference",
-        lambda x, u, params: x.velocity,
-    ),
-    Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+    _outputs.POSITION,
+    _outputs.ATTITUDE,
+    _outputs.VELOCITY,
+    _outputs.rate(lambda x, u, params: x.rate),
 )
 
 
@@ -393,4 +379,4 @@ MODEL = for_points(_FEWEST)
 BILINEAR = for_points(_FEWEST, True)
 
 
-__getattr__ = renamed(__name__, {"SeenPoint": "BilinearPoint"})
+__getattr__ = renamed(__name__, "SeenPoint>BilinearPoint")

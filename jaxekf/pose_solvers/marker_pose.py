@@ -243,10 +243,4 @@ def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[
     return start, stop, (early, late)
 
 
-__getattr__ = renamed(
-    __name__,
-    {
-        "Fit": "MarkerPose",
-        "first_steady": "first_consistent_pose",
-    },
-)
+__getattr__ = renamed(__name__, "Fit>MarkerPose first_steady>first_consistent_pose")

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
+from jaxekf.geometry import pinhole
 from jaxekf.geometry.host_rotation import nearest_rotation, skew
-from jaxekf.geometry.pinhole import NEAREST
 from jaxekf.recordings.types import Camera, Flags, Floats, Optical, from_scipy, to_scipy
 
 FEWEST, _FEWEST_FLAT = 6, 4
@@ -208,13 +208,8 @@ def _directions(points: _Points) -> Floats:
     point = bent
     with np.errstate(all="ignore"):
         for _ in range(8):
-            point = bent / _stretch(points.radial, point)[..., None]
+            point = bent / pinhole.stretch(points.radial, point)[..., None]
     return point
-
-
-def _stretch(radial: Floats, point: Floats) -> Floats:
-    r2 = np.sum(point * point, axis=-1)
-    return 1.0 + (radial[0] + radial[1] * r2) * r2
 
 
 # --- the linear start ---------------------------------------------------------------------------------
@@ -261,9 +256,9 @@ def _linear_start(
             if found is None:
                 continue
             inside = (place - found[1]) @ found[0]
-            depth = np.maximum(inside[:, 2:], NEAREST)
+            depth = np.maximum(inside[:, 2:], pinhole.NEAREST)
             off = np.linalg.norm(inside[:, :2] / depth - direction, axis=1)
-            off[inside[:, 2] <= NEAREST] = np.inf
+            off[inside[:, 2] <= pinhole.NEAREST] = np.inf
             if (middling := float(np.median(off))) < least:
                 best, least = found, middling
             if least < _GOOD_START:
@@ -338,9 +333,9 @@ def _linearise(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Flo
     (N, 3, 3) and the position (N, 3).
     """
     inside = (points.place - away[:, None]) @ turn
-    depth = np.maximum(inside[..., 2], NEAREST)
+    depth = np.maximum(inside[..., 2], pinhole.NEAREST)
     point = inside[..., :2] / depth[..., None]
-    r2, stretch = np.sum(point * point, axis=-1), _stretch(points.radial, point)
+    r2, stretch = np.sum(point * point, axis=-1), pinhole.stretch(points.radial, point)
     seen = points.focal * point * stretch[..., None] + points.centre
     pixel = np.where(points.usable[..., None], points.pixel, seen)
     # Derivative of ``point * stretch`` by the point, then by the landmark in the camera frame.
@@ -411,10 +406,4 @@ def _body_poses(
     return Resection(q, where, cov, scale, valid, fits)
 
 
-__getattr__ = renamed(
-    __name__,
-    {
-        "no_pose": "no_pose_error",
-        "solved": "cached_poses",
-    },
-)
+__getattr__ = renamed(__name__, "no_pose>no_pose_error solved>cached_poses")

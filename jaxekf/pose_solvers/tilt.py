@@ -133,10 +133,5 @@ def _trailing(values: Floats, width: int) -> Floats:
 
 __getattr__ = renamed(
     __name__,
-    {
-        "Field": "MagneticField",
-        "field": "magnetic_field",
-        "still": "static_samples",
-        "turned": "integrated_attitude",
-    },
+    "Field>MagneticField field>magnetic_field still>static_samples turned>integrated_attitude",
 )

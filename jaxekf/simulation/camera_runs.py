@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxekf.geometry.pinhole import NEAREST
+from jaxekf.geometry import pinhole
 from jaxekf.recordings.types import (
     Camera,
     Encoder,
@@ -251,12 +251,11 @@ def _camera(
 
 def _image(inside: Floats, mount: Mount) -> tuple[Floats, Flags]:
     """Image points (N, L, 2) of landmarks (N, L, 3) in the camera frame, and those within the image."""
-    ahead = inside[..., 2] > 10.0 * NEAREST
+    ahead = inside[..., 2] > 10.0 * pinhole.NEAREST
     point = inside[..., :2] / np.where(ahead, inside[..., 2], 1.0)[..., None]
     r2 = np.sum(point * point, axis=-1)
     # Beyond the corners the distortion would fold points back into the image.
     ahead &= r2 < 1.1 * np.sum((np.array(IMAGE) / (2.0 * FOCAL)) ** 2) / 0.9**2
-    stretch = 1.0 + (mount.radial[0] + mount.radial[1] * r2) * r2
-    pixel = FOCAL * point * stretch[..., None] + np.array(IMAGE) / 2.0
+    pixel = FOCAL * point * pinhole.stretch(mount.radial, point)[..., None] + np.array(IMAGE) / 2.0
     inside_image = ((pixel >= 0.0) & (pixel < np.array(IMAGE))).all(axis=-1)
     return pixel, ahead & inside_image

@@ -248,12 +248,17 @@ def fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
     tracker, gyroscope
         (N, 3) relative rotations, rad, as in `RelativeRotations`.
     """
-    size = np.linalg.norm(tracker, axis=1)
-    weight = np.minimum(1.0, np.quantile(size, 0.95) / np.maximum(size, 1e-12))
-    found = _motion_fit(tracker * weight[:, None], gyroscope * weight[:, None])
+    weight = limiting_weights(tracker, 0.95)
+    found = _motion_fit(tracker * weight, gyroscope * weight)
     off = np.linalg.norm(tracker - gyroscope @ found.frame.T / found.rate_ratio, axis=1)
     kept = off <= np.quantile(off, 1.0 - _OUTLIER_SHARE)
     return _motion_fit(tracker[kept], gyroscope[kept])
+
+
+def limiting_weights(vectors: Floats, quantile: float) -> Floats:
+    """Weights (N, 1) that limit the lengths of vectors (N, 3) to a quantile: wrong poses count less."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.minimum(1.0, np.quantile(size, quantile) / np.maximum(size, 1e-12))
 
 
 def _motion_fit(tracker: Floats, gyroscope: Floats) -> MotionFit:

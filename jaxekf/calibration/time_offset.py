@@ -14,7 +14,13 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.motion_agreement import Integral, best_lag, rotation_vectors, sample_pairs
+from jaxekf.calibration.motion_agreement import (
+    Integral,
+    best_lag,
+    limiting_weights,
+    rotation_vectors,
+    sample_pairs,
+)
 from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
@@ -97,10 +103,8 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
             f"{_FEWEST} or more to match the clocks by",
             "a longer recording, or one in which the tool is visible",
         )
-    seconds = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
-    steps = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * np.diff(seconds)[:, None]
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    integral = CubicHermiteSpline(seconds, angle, imu.gyroscope)
+    linear = Integral(imu.time_ns, imu.gyroscope)
+    integral = CubicHermiteSpline(linear.t, linear.sums, imu.gyroscope)
     latency = _coarse_latency(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
     found = _gauss_newton(turns, integral, latency)
     if abs(found.latency_s) >= _LARGEST_S:
@@ -117,11 +121,13 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
             f"{1e3 * _LARGEST_SIGMA_S:.0f} ms or better",
             "a recording in which the tool rotates about several axes at varying speed",
         )
-    _require_rate_changes(optical, imu, found, place)
+    _require_rate_changes(optical, imu, linear, found, place)
     return found
 
 
-def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
+def _require_rate_changes(
+    optical: Optical, imu: Imu, integral: Integral, found: Match, place: object
+) -> None:
     """Raise `RecordingError` unless both streams share the same changes of rate.
 
     At constant rate the only changes are the gyroscope's noise. Some lag always fits that noise best,
@@ -129,9 +135,7 @@ def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: objec
     """
     rows = np.flatnonzero(optical.valid)
     t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
-    integral = Integral(imu.time_ns, imu.gyroscope)
-    period = period_ns(optical.time_ns) / NANOSECONDS
-    span = max(_BLOCK_S, period)
+    span = max(_BLOCK_S, period_ns(optical.time_ns) / NANOSECONDS)
     last = float(integral.t[-1])
     begin, end = sample_pairs(t, span, last, max(1, int((t[-1] - t[0]) / span)))
     q = optical.q_ref_body[rows]
@@ -146,15 +150,14 @@ def _require_rate_changes(optical: Optical, imu: Imu, found: Match, place: objec
     squares = float(np.sum(one**2) * np.sum(other**2))
     correlation = shared / np.sqrt(squares) if squares > 0.0 else 0.0
     # Fisher's transform makes the bound right for few blocks, too.
-    deviations = np.arctanh(
-        np.clip(correlation, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
-    ) * np.sqrt(max(one.size - 3, 1))
-    if deviations < _SIGNIFICANT:
+    scale = np.sqrt(max(one.size - 3, 1))
+    limited = np.clip(correlation, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
+    if np.arctanh(limited) * scale < _SIGNIFICANT:
         raise RecordingError(
             str(place),
             "too little rotation of varying speed: tracker and gyroscope do not correlate"
             f" (correlation {correlation:.2f})",
-            f"{np.tanh(_SIGNIFICANT / np.sqrt(max(one.size - 3, 1))):.2f} or more",
+            f"{np.tanh(_SIGNIFICANT / scale):.2f} or more",
             "a recording in which the tool rotates about several axes at varying speed",
         )
 
@@ -202,9 +205,8 @@ def _gauss_newton(turns: _Rotations, integral: CubicHermiteSpline, latency: floa
     rate = integral.derivative()
     span = turns.end - turns.begin
     integrated = integral(turns.end - latency) - integral(turns.begin - latency)
-    size = np.linalg.norm(turns.turn, axis=1)
-    weight = np.minimum(1.0, np.quantile(size, 0.98) / np.maximum(size, 1e-12))
-    turn = Rotation.from_matrix(nearest_rotation((weight[:, None] * turns.turn).T @ integrated))
+    weight = limiting_weights(turns.turn, 0.98)
+    turn = Rotation.from_matrix(nearest_rotation((weight * turns.turn).T @ integrated))
     kept = np.ones(len(span), bool)
     design, solution, residual = np.zeros((len(span), 3, 7)), np.zeros(7), turns.turn
     design[:, :, 3:6] = -span[:, None, None] * np.eye(3)

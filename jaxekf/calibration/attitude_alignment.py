@@ -217,9 +217,9 @@ def _linearise(
     constant = _mean_rotation(stretches, stretches.q * body.inv(), kept)
     expected = constant * body
     off = expected.apply((stretches.q.inv() * expected).as_rotvec())
-    of_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), integral.q_integral)
-    of_latency = -(constant * integral.q).apply(integral.rate)
-    columns = np.concatenate([expected.as_matrix(), of_bias, of_latency[:, :, None]], axis=2)
+    d_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), integral.q_integral)
+    d_latency = -(constant * integral.q).apply(integral.rate)
+    columns = np.concatenate([expected.as_matrix(), d_bias, d_latency[:, :, None]], axis=2)
     return columns, stretches.remove_mean(off, kept)
 
 

@@ -159,22 +159,22 @@ def tracker_noise(
     if recording.optical is not None:
         stream = recording.optical
         t = (stream.time_ns - stream.latency_ns - start) / NANOSECONDS
-        seen = stream.valid & (t >= begin) & (t <= end)
-        optical = _attitude_scatter(stream, seen)
+        valid = stream.valid & (t >= begin) & (t <= end)
+        optical = _attitude_scatter(stream, valid)
         if stream.position is not None:
-            position = _scatter([stream.position], stream.time_ns, [seen])
+            position = _scatter([stream.position], stream.time_ns, [valid])
     if recording.markers is not None:
         marker = _marker_scatter(recording.markers, start, begin, end)
     return TrackerNoise(optical, position, marker)
 
 
-def _attitude_scatter(stream: Optical, seen: Flags) -> Scatter | None:
+def _attitude_scatter(stream: Optical, valid: Flags) -> Scatter | None:
     """Scatter of the rotation vectors from the mean attitude, body frame."""
-    if seen.sum() < _LEAST_SAMPLES:
+    if valid.sum() < _LEAST_SAMPLES:
         return None
     attitude = to_scipy(stream.q_ref_body)
-    middle = to_scipy(stream.q_ref_body[seen]).mean()
-    return _scatter([(middle.inv() * attitude).as_rotvec()], stream.time_ns, [seen])
+    middle = to_scipy(stream.q_ref_body[valid]).mean()
+    return _scatter([(middle.inv() * attitude).as_rotvec()], stream.time_ns, [valid])
 
 
 def _marker_scatter(markers: Markers, start: int, begin: float, end: float) -> Scatter | None:
@@ -185,15 +185,15 @@ def _marker_scatter(markers: Markers, start: int, begin: float, end: float) -> S
     return _scatter(places, markers.time_ns, [markers.usable[:, i] & inside for i in range(count)])
 
 
-def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter | None:
+def _scatter(values: list[Floats], time_ns: Times, valid: list[Flags]) -> Scatter | None:
     """Scatter of series (N, 3) that share one deviation: half the mean square of differences of neighbours.
 
     The estimate from ``n`` differences has ``2 n^2 / (3 n - 1)`` degrees of freedom (von Neumann). Outliers
     among the differences are left out.
     """
     steps, about = [], []
-    for value, valid in zip(values, seen, strict=True):
-        rows = np.flatnonzero(valid)
+    for value, mask in zip(values, valid, strict=True):
+        rows = np.flatnonzero(mask)
         near = np.diff(time_ns[rows]) <= _LONGEST_GAP * period_ns(time_ns)
         steps.append(np.diff(value[rows], axis=0)[near])
         if rows.size:

@@ -121,7 +121,7 @@ def start_for(model: Model, found: StaticNoise) -> NoiseStart:
                 changes[name] = value
             sentences += text
     for label, sensor in found.sensors.items():
-        bands, half = [made.band_hz for made in sensor.axes], 0.5 / sensor.curve.tau[0]
+        bands, half = [axis_noise.band_hz for axis_noise in sensor.axes], 0.5 / sensor.curve.tau[0]
         if min(bands) < 0.9 * half and label in changes:
             sentences.append(
                 f"{label}: densities are valid up to {min(bands):.2g} Hz; from there to {half:.3g} Hz the"
@@ -215,16 +215,16 @@ def as_dict(found: StaticNoise) -> dict[str, Any]:
         floor, at = sensor.floor()
         document[label] = {"unit": sensor.unit}
         for i, axis in enumerate(AXES):
-            made = sensor.axes[i]
+            axis_noise = sensor.axes[i]
             document[label][axis] = {
-                "white": _interval(made.white),
-                "walk": _interval(made.walk),
-                "walk_standing_for_flicker": _interval(made.walk_alone),
-                "flicker": made.flicker,
-                "quantisation": made.quantisation,
+                "white": _interval(axis_noise.white),
+                "walk": _interval(axis_noise.walk),
+                "walk_standing_for_flicker": _interval(axis_noise.walk_alone),
+                "flicker": axis_noise.flicker,
+                "quantisation": axis_noise.quantisation,
                 "floor": float(floor[i]),
                 "floor_at_s": float(at[i]),
-                "fitted_up_to_hz": made.band_hz,
+                "fitted_up_to_hz": axis_noise.band_hz,
             }
     for label, scatter in found.tracker._asdict().items():
         if scatter is not None:

@@ -130,14 +130,14 @@ def inspect(recording: Recording) -> Inspection:
         check(recording, found)
     except RecordingError as error:
         faults.append(str(error))
-    aligned, seen = None, camera_evidence(recording)
-    if seen is not None and not faults:
+    aligned, images = None, camera_evidence(recording)
+    if images is not None and not faults:
         try:
-            check_camera(recording, seen)
+            check_camera(recording, images)
         except RecordingError as error:
             faults.append(str(error))
     tracked = recording.optical is not None or recording.markers is not None
-    if recording.imu is None or not (tracked or seen is not None):
+    if recording.imu is None or not (tracked or images is not None):
         lacking = "IMU" if recording.imu is None else "tracker"
         notes.append(f"without {lacking} neither clocks nor units can be compared")
     elif tracked and not faults:
@@ -150,7 +150,7 @@ def inspect(recording: Recording) -> Inspection:
     warnings += _timing_warnings(streams, found)
     warnings += [] if aligned is None else _clock_warnings(aligned)
     warnings += [] if faults else _unit_warnings(recording, found)
-    warnings += [] if faults or seen is None else camera_warnings(seen)
+    warnings += [] if faults or images is None else camera_warnings(images)
     return Inspection(
         recording.name,
         streams,
@@ -161,7 +161,7 @@ def inspect(recording: Recording) -> Inspection:
         tuple(notes),
         _markers(recording),
         _points(recording),
-        seen,
+        images,
     )
 
 

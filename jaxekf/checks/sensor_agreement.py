@@ -215,9 +215,9 @@ def _other_readings(recording: Recording) -> dict[str, motion_agreement.Quaterni
     ]
     order = ",".join([part for part in stated_parts if len(part) == 1] or "wxyz")
     direction = next((part for part in stated_parts if len(part) > 1), "body to reference")
-    turned = "reference to body" if direction == "body to reference" else "body to reference"
+    opposite = "reference to body" if direction == "body to reference" else "body to reference"
     found: dict[str, motion_agreement.QuaternionReading] = {
-        f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
+        f"{order}, {opposite}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
     }
     if order in _ORDERS:
         # Stated scalar first, actually scalar last: the components are shifted by one; or the reverse.

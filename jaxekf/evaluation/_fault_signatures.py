@@ -93,15 +93,15 @@ def find_faults(estimate: Estimate, sensor: str) -> Faults | None:
     time_ns, cov = record.time_ns, record.cov[:, rows, rows]
     gain, bias_gain = _gains(estimate, sensor, rows, cov, used)
     each = _signatures(estimate, time_ns, gain, bias_gain)
-    seen = used & (np.arange(len(used)) > 0)
-    mask = np.repeat(seen[:, None], 3, axis=1)
+    used_rows = used & (np.arange(len(used)) > 0)
+    mask = np.repeat(used_rows[:, None], 3, axis=1)
     white = whiten(record.residual[:, rows], cov, mask)
     white_each = np.zeros_like(each)
-    factor = np.linalg.cholesky(cov[seen])
-    white_each[seen] = np.linalg.solve(factor, each[seen])
+    factor = np.linalg.cholesky(cov[used_rows])
+    white_each[used_rows] = np.linalg.solve(factor, each[used_rows])
     judged = (LATENCY,) if estimate.smoothed else (LATENCY, BIAS, MATRIX)
     chosen = np.r_[judged]
-    x, y = white_each[seen][:, :, chosen].reshape(-1, len(chosen)), white[seen].ravel()
+    x, y = white_each[used_rows][:, :, chosen].reshape(-1, len(chosen)), white[used_rows].ravel()
     information = x.T @ x
     narrow = np.diag(_WIDE[chosen] ** -2)
     size = np.linalg.solve(information + narrow, x.T @ y)
@@ -113,7 +113,7 @@ def find_faults(estimate: Estimate, sensor: str) -> Faults | None:
     return Faults(
         _among_all_faults(size, chosen),
         _among_all_faults(np.linalg.inv(information / variance + narrow), chosen),
-        int(seen.sum()) * 3,
+        int(used_rows.sum()) * 3,
         _among_all_faults(information, chosen),
         time_ns,
         left,
@@ -175,13 +175,13 @@ def _signatures(estimate: Estimate, time_ns: Times, gain: Floats, bias_gain: Flo
     at = _index_at(estimate, time_ns)
     clock = (estimate.time_ns - estimate.time_ns[0]) / NANOSECONDS
     rate, attitude = estimate.rate.value, to_scipy(estimate.attitude.value[at])
-    turned = cumulative_trapezoid(rate, clock, axis=0, initial=0.0)[at]
+    integral = cumulative_trapezoid(rate, clock, axis=0, initial=0.0)[at]
     # The gyroscope's own noise is in the innovations, too, and must not be taken for latency.
     window = max(1, round(_SMOOTH_S / max(float(np.median(np.diff(clock))), 1e-9)))
     smooth = uniform_filter1d(rate, window, axis=0, mode="nearest")
     count = len(time_ns)
     dt = np.diff(time_ns) / NANOSECONDS
-    turn = np.diff(turned, axis=0)
+    turn = np.diff(integral, axis=0)
     eye = np.eye(3)
     pushed, moved = np.zeros((count, 3, 13)), np.zeros((count, 3, 13))
     pushed[1:, :, BIAS] = -dt[:, None, None] * eye

@@ -118,9 +118,9 @@ def autocorrelation(series: Sequence[Floats], lags: int) -> tuple[Floats, Floats
     """
     products = pairs = np.zeros(0)
     for values in series:
-        seen = np.isfinite(values)
+        finite = np.isfinite(values)
         size: Any = next_fast_len(len(values) + lags + 1, real=True)
-        found = [_lagged(np.where(seen, values, 0.0), lags, size), _lagged(seen, lags, size)]
+        found = [_lagged(np.where(finite, values, 0.0), lags, size), _lagged(finite, lags, size)]
         products = found[0] if products.size == 0 else products + found[0]
         pairs = found[1] if pairs.size == 0 else pairs + found[1]
     pairs = np.round(pairs)

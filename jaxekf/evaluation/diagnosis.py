@@ -130,7 +130,7 @@ def diagnose_many(
         estimates.
     """
     _check(estimates, recordings)
-    names = list(dict.fromkeys(name for made in estimates for name in made.sensors))
+    names = list(dict.fromkeys(name for estimate in estimates for name in estimate.sensors))
     sensors, verdicts, notes = {}, [], []
     for name in names:
         sensors[name], found = _judge_sensor(name, [e for e in estimates if name in e.sensors])
@@ -145,7 +145,7 @@ def diagnose_many(
             notes.append(note)
         else:
             verdicts += judge_part(name, parts[name])
-    runs = tuple(made.run for made in estimates)
+    runs = tuple(estimate.run for estimate in estimates)
     return Diagnosis(runs, sensors, parts, tuple(verdicts), tuple(notes))
 
 
@@ -154,13 +154,13 @@ def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None
         raise ValueError(
             "got no estimates, expected at least one; pass the result of jaxekf.estimate_many"
         )
-    if excerpts := [made.run for made in estimates if made.excerpt]:
+    if excerpts := [estimate.run for estimate in estimates if estimate.excerpt]:
         raise ValueError(
             f"got requested times of {excerpts} only, expected whole estimates, whose states belong"
             " to the innovations; pass the estimates before the selection of times"
         )
     if recordings is not None:
-        runs, given = [made.run for made in estimates], [r.name for r in recordings]
+        runs, given = [estimate.run for estimate in estimates], [r.name for r in recordings]
         if runs != given:
             raise ValueError(
                 f"got recordings {given} for estimates of {runs}, expected the same runs in the same"
@@ -172,13 +172,13 @@ def _judge_sensor(
     name: str, estimates: Sequence[Estimate]
 ) -> tuple[SensorDiagnosis, list[Verdict]]:
     """Statistics of one sensor over several runs, and verdicts on them."""
-    records = [made.sensors[name] for made in estimates]
+    records = [estimate.sensors[name] for estimate in estimates]
     freedom = [(r.used | r.gated).sum(axis=1) for r in records]
     nis = judge_squares([r.nis for r in records], freedom)
     white = [whiten(r.residual, r.cov, r.used) for r in records]
     times = [r.time_ns for r in records]
     whiteness = judge_whiteness(times, white)
-    each = [find_faults(made, name) for made in estimates]
+    each = [find_faults(estimate, name) for estimate in estimates]
     known = [found for found in each if found is not None and found.rows]
     faults = _pooled(known)
     diagnosis = SensorDiagnosis(nis, whiteness, faults)
@@ -229,12 +229,12 @@ def _errors(
 ) -> dict[str, list[Floats]]:
     """Normalised squares of the errors of each output with ground truth, run by run."""
     found: dict[str, list[Floats]] = {}
-    for made, recording in zip(estimates, recordings, strict=False):
+    for estimate, recording in zip(estimates, recordings, strict=False):
         if recording.encoder is None:
             continue
-        for name, error in scored_errors(made, recording).items():
+        for name, error in scored_errors(estimate, recording).items():
             kept: Flags = np.asarray(np.isfinite(error).all(axis=1))
-            squares = normalised_square(error[kept], made.outputs[name].cov[kept])
+            squares = normalised_square(error[kept], estimate.outputs[name].cov[kept])
             found.setdefault(name, []).append(squares)
     return found
 

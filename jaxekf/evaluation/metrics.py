@@ -149,9 +149,9 @@ def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:
     """The last visible attitude (N, 4) of the tracker at each time: the baseline without a filter."""
-    seen = np.flatnonzero(optical.valid)
-    at = np.searchsorted(optical.time_ns[seen], time_ns, side="right") - 1
-    return optical.q_ref_body[seen[np.maximum(at, 0)]]
+    rows = np.flatnonzero(optical.valid)
+    at = np.searchsorted(optical.time_ns[rows], time_ns, side="right") - 1
+    return optical.q_ref_body[rows[np.maximum(at, 0)]]
 
 
 def score_hold_last(recording: Recording, time_ns: Times) -> float:

@@ -48,8 +48,8 @@ def project(lens: Lens, p_camera: Array) -> Array:
     (2,) pixels.
     """
     in_front = p_camera[2] > NEAREST
-    seen = jnp.where(in_front, p_camera, jnp.array([0.0, 0.0, 1.0]))
-    point = seen[:2] / seen[2]
+    visible = jnp.where(in_front, p_camera, jnp.array([0.0, 0.0, 1.0]))
+    point = visible[:2] / visible[2]
     there = lens.focal * point * stretch(lens.radial, point) + lens.centre
     return jnp.where(in_front, there, lens.focal * _BESIDE + lens.centre)
 

@@ -150,8 +150,8 @@ def _with_derivatives(q: Array, profile: Array) -> Array:
     curvature = jnp.trace(now) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(now)
     inverse = _inverse(curvature)
     for _ in range(2):
-        turned = linalg.multiply(rotation.to_matrix(q).T, profile)
-        half_step = 0.5 * jnp.sum(inverse * _axial(turned)[None, :], axis=1)
+        rotated = linalg.multiply(rotation.to_matrix(q).T, profile)
+        half_step = 0.5 * jnp.sum(inverse * _axial(rotated)[None, :], axis=1)
         q = rotation.normalise(q + rotation.product(q, rotation.pure(half_step)))
     return q
 

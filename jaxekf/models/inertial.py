@@ -198,8 +198,8 @@ def _rate(x: State, measured: Array, params: Parameters) -> Array:
 
 
 def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
-    swing = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
-    return x.velocity + rotation.rotate(x.q_ref_body, swing)
+    lever_velocity = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
+    return x.velocity + rotation.rotate(x.q_ref_body, lever_velocity)
 
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:

@@ -69,8 +69,8 @@ SPACE: Any = State(AdditiveQuaternion(), Euclidean(3, "rad/s"), Euclidean(3, "ra
 
 def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
     """Eq. 14: ``q(k+1) = g(rate, T) q(k)``; rate and bias are random walks (eqs. 9, 10)."""
-    turned = rotation.product(rotation.exp(x.rate_ref * dt), x.q_ref_body)
-    return State(turned + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
+    rotated = rotation.product(rotation.exp(x.rate_ref * dt), x.q_ref_body)
+    return State(rotated + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
 
 
 def process_noise(params: Parameters, dt: Array) -> Array:

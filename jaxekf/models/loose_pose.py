@@ -86,11 +86,11 @@ def raw_pose(recording: Recording) -> Optical:
 def _source(recording: Recording) -> Samples:
     optical = raw_pose(recording)
     position = sources.tracked_position(optical, recording)
-    seen = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
-    value = Pose(np.where(seen[:, None], position, 0.0), optical.q_ref_body)
-    error = np.zeros(len(seen)) if optical.error is None else np.nan_to_num(optical.error)
+    valid = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
+    value = Pose(np.where(valid[:, None], position, 0.0), optical.q_ref_body)
+    error = np.zeros(len(valid)) if optical.error is None else np.nan_to_num(optical.error)
     taken = optical.time_ns - optical.latency_ns
-    return Samples(taken, value, seen, error, optical.latency_ns, ("optical",))
+    return Samples(taken, value, valid, error, optical.latency_ns, ("optical",))
 
 
 def _setup(recording: Recording) -> Setup:
@@ -104,28 +104,28 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
 
     See `marker_pose.first_consistent_pose`; a pose from single markers must also fit the tool.
     """
-    seen = samples["optical"]
-    visible = np.asarray(seen.mask.all(axis=1))
+    tracked = samples["optical"]
+    visible = np.asarray(tracked.mask.all(axis=1))
     if recording.optical is None and recording.markers is not None:
-        visible &= _fits(recording, seen.time_ns)
+        visible &= _fits(recording, tracked.time_ns)
     arm = _tracked_point(recording)
-    origin = seen.value.position - sources.rotated_to_reference(seen.value.q_ref_body, arm)
-    poses = Optical(seen.time_ns, seen.value.q_ref_body, visible, origin)
+    origin = tracked.value.position - sources.rotated_to_reference(tracked.value.q_ref_body, arm)
+    poses = Optical(tracked.time_ns, tracked.value.q_ref_body, visible, origin)
     first = marker_pose.first_consistent_pose(poses, recording.need_imu())
     if first is None:
         return None
     skipped = int(visible[:first].sum())
     known = {
         "position": origin[first],
-        "q_ref_body": seen.value.q_ref_body[first],
-        "velocity": marker_pose.velocity_at(seen.time_ns, origin, visible, first),
+        "q_ref_body": tracked.value.q_ref_body[first],
+        "velocity": marker_pose.velocity_at(tracked.time_ns, origin, visible, first),
     }
     note = (
         f"{skipped} poses at the start contradict the gyroscope or jump: they are not used"
         if skipped
         else ""
     )
-    return Start(int(seen.time_ns[first]), known, note)
+    return Start(int(tracked.time_ns[first]), known, note)
 
 
 def _fits(recording: Recording, taken: Times) -> Flags:

@@ -212,16 +212,16 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     """The first magnetometer sample that, with the mean specific force after it, gives an attitude."""
     imu, about = earth.require_marg_imu(recording), earth.setup(recording)
     assert imu.accelerometer is not None
-    seen = samples["magnetometer"]
+    field = samples["magnetometer"]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accelerometer, axis=0)])
-    begin = np.searchsorted(imu.time_ns, seen.time_ns)
-    end = np.searchsorted(imu.time_ns, seen.time_ns + int(START_S * NANOSECONDS))
-    found = earth.attitudes(total[end] - total[begin], seen.value, about, LEAST_SINE)
+    begin = np.searchsorted(imu.time_ns, field.time_ns)
+    end = np.searchsorted(imu.time_ns, field.time_ns + int(START_S * NANOSECONDS))
+    found = earth.attitudes(total[end] - total[begin], field.value, about, LEAST_SINE)
     good = np.flatnonzero(np.asarray(found.valid))
     if not good.size:
         return None
     q = np.asarray(found.q_ref_body)[good[0]]
-    return Start(int(seen.time_ns[good[0]]), {"q_ref_body": q})
+    return Start(int(field.time_ns[good[0]]), {"q_ref_body": q})
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:

@@ -45,14 +45,14 @@ def search_regions(params: Parameters, belief: Belief, p_ref_landmark: Array | F
     def one(place: Array) -> Regions:
         aux = visual.Point(place, jnp.zeros(()))
 
-        def seen(delta: Array) -> Array:
+        def image_point(delta: Array) -> Array:
             x = manifold.retract(visual.SPACE, belief.mean, delta)
             return visual.predict_point(x, None, params, aux)
 
-        slope = jax.jacfwd(seen)(zero)
+        slope = jax.jacfwd(image_point)(zero)
         cov = linalg.congruence(slope, belief.cov) + visual.point_noise(params, aux, zero[0])
         depth = visual.in_camera(belief.mean, params, place)[2]
-        return Regions(seen(zero), cov, depth > pinhole.NEAREST)
+        return Regions(image_point(zero), cov, depth > pinhole.NEAREST)
 
     return jax.vmap(one)(jnp.asarray(p_ref_landmark))
 

@@ -138,13 +138,13 @@ def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> Sta
     ``w`` holds the changes of acceleration, rate and both biases. Their effect on position, velocity and
     attitude during the step is that of a change at constant speed.
     """
-    jump, swing = w[:3], w[3:6]
+    acceleration_change, rate_change = w[:3], w[3:6]
     return State(
-        x.position + (x.velocity + (x.acceleration / 2.0 + jump / 6.0) * dt) * dt,
-        x.velocity + (x.acceleration + jump / 2.0) * dt,
-        x.acceleration + jump,
-        SO3().retract(x.q_ref_body, (x.rate + swing / 2.0) * dt),
-        x.rate + swing,
+        x.position + (x.velocity + (x.acceleration / 2.0 + acceleration_change / 6.0) * dt) * dt,
+        x.velocity + (x.acceleration + acceleration_change / 2.0) * dt,
+        x.acceleration + acceleration_change,
+        SO3().retract(x.q_ref_body, (x.rate + rate_change / 2.0) * dt),
+        x.rate + rate_change,
         x.bias + w[6:9],
         x.accelerometer_bias + w[9:],
     )

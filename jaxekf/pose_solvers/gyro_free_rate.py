@@ -127,8 +127,8 @@ def _has_second_solution(
     moved = jnp.sqrt(jnp.sum((rate - before) ** 2))
     reach = jnp.maximum(jnp.sqrt(jnp.sum(rate * rate)), 0.5 * (1.0 + _AS_FAR) * moved)
     curved = problem.curved.reshape(-1, 9)
-    seen = multiply(factors.basis.T, curved).reshape(3, 3, 3)
-    change = multiply(factors.inverse.T, seen.swapaxes(0, 1).reshape(3, 9))
+    projected = multiply(factors.basis.T, curved).reshape(3, 3, 3)
+    change = multiply(factors.inverse.T, projected.swapaxes(0, 1).reshape(3, 9))
     regular = ~factors.weak & (2.0 * reach * jnp.sqrt(jnp.sum(change**2)) < 1.0)
 
     def search() -> Array:

@@ -71,12 +71,12 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
     usable = usable & np.isfinite(position).all(axis=2)
     count = usable.sum(axis=1)
     weight = usable / np.maximum(count, 1)[:, None]
-    seen = np.where(usable[..., None], position, 0.0)
-    body = np.broadcast_to(p_body_marker, seen.shape)
+    measured = np.where(usable[..., None], position, 0.0)
+    body = np.broadcast_to(p_body_marker, measured.shape)
     centre_body = np.einsum("nm,nmi->ni", weight, body)
-    centre_ref = np.einsum("nm,nmi->ni", weight, seen)
+    centre_ref = np.einsum("nm,nmi->ni", weight, measured)
     from_body = body - centre_body[:, None]
-    from_ref = seen - centre_ref[:, None]
+    from_ref = measured - centre_ref[:, None]
     spread = np.linalg.svd(
         np.where(usable[..., None], from_body, 0.0), compute_uv=False, full_matrices=False
     )
@@ -160,27 +160,27 @@ def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
     without any. A tracker that has just found its tool may begin with a wrong pose, which persists
     for as long as gates refuse the samples that contradict it.
     """
-    seen = np.flatnonzero(optical.valid)
-    if seen.size == 0:
+    rows = np.flatnonzero(optical.valid)
+    if rows.size == 0:
         return None
-    times = optical.time_ns[seen] - optical.latency_ns
+    times = optical.time_ns[rows] - optical.latency_ns
     span = np.diff(times) / NANOSECONDS
     known = (imu.time_ns - times[0]) / NANOSECONDS
     middle = (times[:-1] - times[0]) / NANOSECONDS + 0.5 * span
     rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
-    turn = to_scipy(optical.q_ref_body[seen])
+    turn = to_scipy(optical.q_ref_body[rows])
     measured = Rotation.from_rotvec(rate * span[:, None])
     off = (measured.inv() * turn[:-1].inv() * turn[1:]).magnitude()
     near = span <= _LONGEST_STEP_S
     if not near.any():
-        return int(seen[0])
+        return int(rows[0])
     good = near & (off <= max(_LEAST_TURN, _START_TURN * float(np.median(off[near]))))
     if optical.position is not None:
-        good &= np.linalg.norm(np.diff(optical.position[seen], axis=0), axis=1) <= (
+        good &= np.linalg.norm(np.diff(optical.position[rows], axis=0), axis=1) <= (
             _LARGEST_SPEED * span
         )
     good &= times[:-1] - times[0] <= _START_S * NANOSECONDS
-    return int(seen[np.argmax(good)]) if good.any() else int(seen[0])
+    return int(rows[np.argmax(good)]) if good.any() else int(rows[0])
 
 
 def gravity(optical: Optical, imu: Imu, place: object) -> Floats:

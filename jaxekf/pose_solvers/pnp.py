@@ -104,36 +104,36 @@ def _poses(camera: Camera) -> Resection:
     usable = points.usable & np.asarray((np.abs(direction) < _WIDEST).all(axis=2))
     points = points._replace(usable=usable)
     count = len(images)
-    turn, away = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    rotation, position = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     valid = np.zeros(count, bool)
     rng = np.random.default_rng(0)
     for i in np.flatnonzero(usable.sum(axis=1) >= _FEWEST_FLAT):
         found = _linear_start(direction[i, usable[i]], points.place[i, usable[i]], rng)
         if found is not None:
-            turn[i], away[i], valid[i] = *found, True
+            rotation[i], position[i], valid[i] = *found, True
     for _ in range(_ITERATIONS):
-        residual, slope = _linearise(points, turn, away)
+        residual, slope = _linearise(points, rotation, position)
         scale = _scale(residual, usable)
         weight = _weights(residual, scale, usable & valid[:, None])
         step, _ = _gauss_newton_step(residual, slope, weight)
-        away = away + step[:, :3]
-        turn = turn @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
+        position = position + step[:, :3]
+        rotation = rotation @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
         if np.abs(step[valid]).max(initial=0.0) < _CONVERGED:
             break
-    residual, slope = _linearise(points, turn, away)
+    residual, slope = _linearise(points, rotation, position)
     scale = _scale(residual, usable)
     weight = _weights(residual, scale, usable & valid[:, None])
     counted = (weight > 0.0).sum(axis=1)
     valid &= scale <= _LARGEST_ERROR * float(np.mean(camera.focal))
     valid &= counted >= np.maximum(_FEWEST_FLAT, _LEAST_SHARE * usable.sum(axis=1))
-    valid &= np.isfinite(away).all(axis=1)
+    valid &= np.isfinite(position).all(axis=1)
     # Correction for the six parameters of the pose.
     free = np.maximum(2 * counted - 6, 1)
     scale = scale * np.sqrt(np.maximum(2 * counted, 1) / free)
     _, information = _gauss_newton_step(residual, slope, weight)
     fits = np.zeros((count, len(camera.names)), bool)
     np.put_along_axis(fits, order, (weight > 0.0) & valid[:, None], axis=1)
-    found = _body_poses(camera, turn, away, information, scale, valid, fits)
+    found = _body_poses(camera, rotation, position, information, scale, valid, fits)
     return _for_all_images(found, images, len(camera.time_ns))
 
 
@@ -191,10 +191,10 @@ def _points(camera: Camera, images: Any) -> tuple[_Points, Any]:
 
     An image shows a few of a scene's many landmarks, so the others are left out.
     """
-    seen = camera.usable[images]
-    most = int(seen.sum(axis=1).max(initial=1))
-    order = np.argsort(~seen, axis=1, kind="stable")[:, :most]
-    usable = np.take_along_axis(seen, order, axis=1)
+    visible = camera.usable[images]
+    most = int(visible.sum(axis=1).max(initial=1))
+    order = np.argsort(~visible, axis=1, kind="stable")[:, :most]
+    usable = np.take_along_axis(visible, order, axis=1)
     pixel = np.take_along_axis(camera.pixel[images], order[..., None], axis=1)
     centre = np.asarray(camera.centre, float)
     pixel = np.where(usable[..., None], pixel, centre)
@@ -204,11 +204,11 @@ def _points(camera: Camera, images: Any) -> tuple[_Points, Any]:
 
 def _directions(points: _Points) -> Floats:
     """(N, M, 2) undistorted rays: intersections with the plane at depth 1."""
-    bent = (points.pixel - points.centre) / points.focal
-    point = bent
+    distorted = (points.pixel - points.centre) / points.focal
+    point = distorted
     with np.errstate(all="ignore"):
         for _ in range(8):
-            point = bent / pinhole.stretch(points.radial, point)[..., None]
+            point = distorted / pinhole.stretch(points.radial, point)[..., None]
     return point
 
 
@@ -312,9 +312,9 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     if length <= 1e-12:
         return None
     one, two = matrix[:, 0] / length, matrix[:, 1] / length
-    turn = nearest_rotation(np.stack([one, two, np.cross(one, two)], axis=1))
+    rotation = nearest_rotation(np.stack([one, two, np.cross(one, two)], axis=1))
     whole = np.stack([axes[0], axes[1], np.cross(axes[0], axes[1])])
-    towards = turn @ whole
+    towards = rotation @ whole
     return towards.T, middle - size * towards.T @ matrix[:, 2] / length
 
 
@@ -326,30 +326,30 @@ def _null_vector(matrix: Floats) -> Floats:
 # --- Gauss and Newton ---------------------------------------------------------------------------------
 
 
-def _linearise(points: _Points, turn: Floats, away: Floats) -> tuple[Floats, Floats]:
+def _linearise(points: _Points, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
     """Residuals (N, M, 2), pixels, and their derivatives (N, M, 2, 6) by the camera's pose.
 
     The pose consists of the position in the reference frame and a rotation in the camera frame, at the axes
     (N, 3, 3) and the position (N, 3).
     """
-    inside = (points.place - away[:, None]) @ turn
+    inside = (points.place - position[:, None]) @ rotation
     depth = np.maximum(inside[..., 2], pinhole.NEAREST)
     point = inside[..., :2] / depth[..., None]
     r2, stretch = np.sum(point * point, axis=-1), pinhole.stretch(points.radial, point)
-    seen = points.focal * point * stretch[..., None] + points.centre
-    pixel = np.where(points.usable[..., None], points.pixel, seen)
+    projected = points.focal * point * stretch[..., None] + points.centre
+    pixel = np.where(points.usable[..., None], points.pixel, projected)
     # Derivative of ``point * stretch`` by the point, then by the landmark in the camera frame.
-    bent = 2.0 * (points.radial[0] + 2.0 * points.radial[1] * r2)
-    by_point = stretch[..., None, None] * np.eye(2)
-    by_point = by_point + bent[..., None, None] * point[..., :, None] * point[..., None, :]
-    by_point = points.focal[:, None] * by_point
-    by_inside = np.zeros((*depth.shape, 2, 3))
-    by_inside[..., 0, 0] = by_inside[..., 1, 1] = 1.0 / depth
-    by_inside[..., 2] = -point / depth[..., None]
-    slope = by_point @ by_inside
-    by_place = -slope @ np.swapaxes(turn, 1, 2)[:, None]
-    by_turn = slope @ skew(inside)
-    return pixel - seen, np.concatenate([by_place, by_turn], axis=-1)
+    distorted = 2.0 * (points.radial[0] + 2.0 * points.radial[1] * r2)
+    d_point = stretch[..., None, None] * np.eye(2)
+    d_point = d_point + distorted[..., None, None] * point[..., :, None] * point[..., None, :]
+    d_point = points.focal[:, None] * d_point
+    d_camera = np.zeros((*depth.shape, 2, 3))
+    d_camera[..., 0, 0] = d_camera[..., 1, 1] = 1.0 / depth
+    d_camera[..., 2] = -point / depth[..., None]
+    slope = d_point @ d_camera
+    d_position = -slope @ np.swapaxes(rotation, 1, 2)[:, None]
+    d_rotation = slope @ skew(inside)
+    return pixel - projected, np.concatenate([d_position, d_rotation], axis=-1)
 
 
 def _scale(residual: Floats, usable: Flags) -> Floats:
@@ -381,8 +381,8 @@ def _gauss_newton_step(residual: Floats, slope: Floats, weight: Floats) -> tuple
 
 def _body_poses(
     camera: Camera,
-    turn: Floats,
-    away: Floats,
+    rotation: Floats,
+    position: Floats,
     information: Floats,
     scale: Floats,
     valid: Flags,
@@ -390,11 +390,11 @@ def _body_poses(
 ) -> Resection:
     """Poses of the body from those of the camera."""
     mount = to_scipy(camera.q_body_camera)
-    body = Rotation.from_matrix(turn) * mount.inv()
-    position = away - body.apply(camera.p_body_camera)
+    body = Rotation.from_matrix(rotation) * mount.inv()
+    position = position - body.apply(camera.p_body_camera)
     cov = scale[:, None, None] ** 2 * np.linalg.inv(information)
-    # Errors of the body's position, ``d away - d(R) p``, and of its attitude, rotated into the body.
-    change = np.zeros((len(away), 6, 6))
+    # Errors of the body's position, ``d position - d(R) p``, and of its attitude, rotated into the body.
+    change = np.zeros((len(position), 6, 6))
     change[:, :3, :3] = np.eye(3)
     change[:, 3:, 3:] = mount.as_matrix()
     lever: Any = body.as_matrix() @ skew(camera.p_body_camera)

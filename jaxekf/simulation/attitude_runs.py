@@ -298,9 +298,9 @@ def draw(
     def epoch(x: Any, given: Any) -> Any:
         dt, u, fast, slow, key = given
         keys = jax.random.split(key, dt.shape[0] + 1)
-        x, (states, seen) = lax.scan(substep, x, (dt, u, fast, keys[:-1]))
+        x, (states, measured) = lax.scan(substep, x, (dt, u, fast, keys[:-1]))
         last = None if u is None else jax.tree.map(lambda a: a[-1], u)
-        return x, (states, seen, measure(x, last, slow, keys[-1]))
+        return x, (states, measured, measure(x, last, slow, keys[-1]))
 
     keys = jax.random.split(key, steps.dt.shape[0])
     given = (steps.dt, inputs, steps.fast, steps.slow, keys)

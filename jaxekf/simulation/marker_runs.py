@@ -218,16 +218,16 @@ def tool_markers(
     """The tracker's measurement of the tool; hidden markers are NaN."""
     t = seconds(taken_ns)
     q, _ = motion.attitude.attitude(t)
-    turned = np.stack([to_scipy(q).apply(place) for place in tool.p_body_marker], axis=1)
-    exact = motion.position(t)[:, None] + turned
-    seen = exact + 1e-3 * grade.marker_mm * rng.standard_normal(exact.shape)
-    visible = np.ones(seen.shape[:2], bool)
+    arms = np.stack([to_scipy(q).apply(place) for place in tool.p_body_marker], axis=1)
+    exact = motion.position(t)[:, None] + arms
+    measured = exact + 1e-3 * grade.marker_mm * rng.standard_normal(exact.shape)
+    visible = np.ones(measured.shape[:2], bool)
     for name, begin, end in hidden:
         visible[(t >= begin) & (t < end), tool.names.index(name)] = False
-    seen[~visible] = np.nan
+    measured[~visible] = np.nan
     latency = round(grade.latency_s * 1e9)
     return Markers(
-        taken_ns + latency, seen, visible, tool.names, tool.p_body_marker, latency_ns=latency
+        taken_ns + latency, measured, visible, tool.names, tool.p_body_marker, latency_ns=latency
     )
 
 

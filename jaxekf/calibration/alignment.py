@@ -178,8 +178,7 @@ def combine_runs(runs: Sequence[RunAlignment]) -> CombinedAlignment:
 
 
 def _mean_drift(found: Sequence[AttitudeMatch]) -> tuple[float, float]:
-    """Weighted mean of the runs that are long enough, and its standard deviation, inflated if they
-    disagree."""
+    """Weighted mean drift of the runs that are long enough, and its standard deviation."""
     known = [m for m in found if np.isfinite(m.drift)]
     if not known:
         return np.nan, np.nan

@@ -52,8 +52,7 @@ class SensorNoise(NamedTuple):
         return np.array([axis.white.value for axis in self.axes])
 
     def floor(self) -> tuple[Floats, Floats]:
-        """Smallest deviation (3,) and the averaging time (3,), s, at which it occurs: the bias
-        instability."""
+        """Bias instability: smallest deviation (3,) and the averaging time (3,), s, at which it occurs."""
         lowest = self.curve.deviation.argmin(axis=0)
         return self.curve.deviation[lowest, range(3)], self.curve.tau[lowest]
 
@@ -181,8 +180,7 @@ def degrees_of_freedom(points: int, m: int, exponent: int) -> float:
 
 
 def _regular(imu: Imu) -> tuple[float, Floats, int]:
-    """Sampling period, evenly spaced samples (n, 3 or 6) of the longest stretch, and the interpolated
-    ones."""
+    """Sampling period, even samples (n, 3 or 6) of the longest stretch, and the number interpolated."""
     values = imu.gyroscope
     if imu.accelerometer is not None:
         values = np.concatenate([values, imu.accelerometer], axis=1)

@@ -197,8 +197,7 @@ def _angle(a: Floats, b: Floats) -> Floats:
 
 
 def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
-    """Lag, s, at which the rotation angles of both streams correlate best; independent of frames and
-    units."""
+    """Lag, s, at which the rotation angles correlate best, independent of frames and units."""
     few = slice(None, None, max(1, -(-len(size) // _SEARCHED)))
     begin, end = begin[few], end[few]
     # Wrong poses would outweigh all motion; where there is little of it, it is not to be cut short itself.

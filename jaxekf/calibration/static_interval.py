@@ -217,8 +217,7 @@ def _scatter(values: list[Floats], time_ns: Times, valid: list[Flags]) -> Scatte
 
 
 def _require_no_rotation(optical: Optical, imu: Imu, end_s: float, place: str) -> None:
-    """Raise `RecordingError` if the tracker rotates: a steady rotation looks like a bias to the
-    gyroscope."""
+    """Raise `RecordingError` if the tracker rotates steadily, which looks like a bias to the gyroscope."""
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     thirds = [
         optical.valid & (t >= share * end_s) & (t <= (share + 1.0 / 3.0) * end_s - _LATE_S / 2.0)

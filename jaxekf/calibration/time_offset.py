@@ -56,9 +56,8 @@ class Match:
     latency_sigma_s: float
     """Its standard deviation, s."""
     alignment: Floats
-    """(3,) rotation vector, rad, from tool frame to IMU frame, as `calibration.alignment` of
-    `loose_pose` and `tight`: the tracker's rate, in the tool frame, is ``exp(alignment)' (gyroscope -
-    bias)``."""
+    """(3,) rotation vector, rad, from tool frame to IMU frame, as `calibration.alignment` of `loose_pose`
+    and `tight`. The tracker's rate, in the tool frame, is ``exp(alignment)' (gyroscope - bias)``."""
     alignment_sigma: Floats
     """(3,) standard deviations, rad; large about an axis if all rotation was about that axis."""
     bias: Floats

@@ -146,8 +146,7 @@ def _force_unit(recording: Recording, found: Evidence) -> tuple[str, RecordingEr
 
 
 def check_gravity(recording: Recording, found: Evidence) -> None:
-    """Raise `RecordingError` if the accelerometer contradicts the stated `gravity_ref` in size or
-    direction."""
+    """Raise `RecordingError` if the accelerometer contradicts size or direction of `gravity_ref`."""
     stated = recording.info.get("gravity_ref")
     if stated is None:
         return

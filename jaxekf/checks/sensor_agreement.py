@@ -228,8 +228,7 @@ def _other_readings(recording: Recording) -> dict[str, motion_agreement.Quaterni
 
 
 def static_norm(imu: Imu) -> tuple[float, float]:
-    """Median norm of the specific force in the quietest seconds, m/s^2, and its relative standard
-    deviation."""
+    """Median norm of the specific force in the quietest seconds, m/s^2, and its relative deviation."""
     if imu.accelerometer is None or len(imu.time_ns) < 2:
         return np.nan, np.nan
     span = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS

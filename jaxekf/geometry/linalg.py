@@ -107,11 +107,10 @@ def adjugate(matrix: Array) -> tuple[Array, Array]:
 
 
 def mask_covariance(matrix: Array, mask: Array) -> Array:
-    """Covariance (m, m, ...) with the rows and columns outside `mask` (m, ...) replaced by those of the
-    identity.
+    """Covariance (m, m, ...) whose rows and columns outside `mask` (m, ...) are those of the identity.
 
-    The visible sub-block is unchanged, so a factor of the result whitens the visible rows as if the
-    masked ones did not exist, correlations included.
+    The visible sub-block is unchanged, so a factor of the result whitens the visible rows as if the masked
+    ones did not exist, correlations included.
     """
     both = mask[:, None] & mask[None, :]
     return jnp.where(both, matrix, identity_like(matrix))

@@ -20,8 +20,7 @@ class Lens(NamedTuple):
     centre: Any
     """(2,) pixels, principal point."""
     radial: Any
-    """(2,) distortion coefficients: a point at radius r appears at ``(1 + radial[0] r^2 + radial[1] r^4)
-    r``."""
+    """(2,) distortion coefficients of the factor ``1 + radial[0] r^2 + radial[1] r^4`` at radius r."""
 
 
 def stretch(radial: Any, point: Any) -> Any:
@@ -55,10 +54,10 @@ def project(lens: Lens, p_camera: Array) -> Array:
 
 
 def ray(lens: Lens, pixel: Array) -> Array:
-    """Direction of an image point: its intersection (2,) with the plane at depth 1; the inverse of
-    `project`.
+    """Direction (2,) of an image point: its intersection with the plane at depth 1.
 
-    A fixed-point iteration, which converges for distortions that keep the order of image points.
+    The inverse of `project` by a fixed-point iteration, which converges for distortions that keep the order
+    of image points.
     """
     bent = (pixel - lens.centre) / lens.focal
     point = bent

@@ -122,25 +122,28 @@ def triad_covariance(
 ) -> Array:
     """Covariance (3, 3), rad^2, of the attitude error of `triad` (eqs. 41 to 46), to first order.
 
-    The error is a rotation vector in the body frame: ``estimate = truth * exp(error)``. With axes
-    ``t1`` along the first vector ``a``, ``t2`` along ``a x b`` and ``t3 = t1 x t2``, changes ``da``
-    and ``db`` of the vectors rotate the axes by ``phi = t1 x da/|a| + t1 (t2.db - (b.t1) t2.da/|a|) /
-    |t1 x b|``: the first part keeps ``t1`` on ``a``, the second keeps ``b`` in the plane of ``t1``
-    and ``t3``. The attitude rotates by ``-phi``.
+    The error is a rotation vector in the body frame: ``estimate = truth * exp(error)``. With axes ``t1``
+    along the first vector ``a``, ``t2`` along ``a x b`` and ``t3 = t1 x t2``, changes ``da`` and ``db`` of
+    the vectors rotate the axes by
+
+        phi = t1 x da/|a| + t1 (t2.db - (b.t1) t2.da/|a|) / |t1 x b|
+
+    The first part keeps ``t1`` on ``a``, the second keeps ``b`` in the plane of ``t1`` and ``t3``. The
+    attitude rotates by ``-phi``.
 
     Parameters
     ----------
     first_body, second_body
         (3,) measured vectors, body frame.
     first_cov, second_cov
-        (3, 3) their covariances, in their own units squared, independent of each other. To include
-        errors of the references, add their covariances, rotated to the body frame and scaled to the
-        body vectors.
+        (3, 3) their covariances, in their own units squared, independent of each other. To include errors
+        of the references, add their covariances, rotated to the body frame and scaled to the body vectors.
     least_sine
         As in `triad`.
 
-    Returns ------- (3, 3); the identity, a standard deviation of one radian, if the body vectors do
-    not determine the attitude.
+    Returns
+    -------
+    (3, 3); the identity, a standard deviation of one radian, if the body vectors leave the attitude open.
 
     Raises
     ------
@@ -206,8 +209,7 @@ def attitude_or(q: Array, valid: Array, near: Array | None, fallback: Array | No
 def _triad_axes(
     first: Array, second: Array, least_sine: Array | float | None
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """Axes along `first`, along the cross product, and along their product; and whether the pair
-    determines them."""
+    """Axes along `first`, the cross product and their product, and whether the pair determines them."""
     dtype = float_type(first, second)
     first, first_usable = directions(jnp.asarray(first, dtype))
     second, second_usable = directions(jnp.asarray(second, dtype))

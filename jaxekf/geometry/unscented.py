@@ -53,10 +53,10 @@ def transform(
         covariance    lambda / (n + lambda) + 1 - alpha^2 + beta     of the point at the mean
         both          1 / (2 (n + lambda))                          of every other point
 
-    With ``n + lambda = 3`` the fourth moments along the axes are those of a Gaussian. ``beta >=
-    alpha^2``, or ``kappa >= 0`` with ``alpha = 1``, keep the covariance positive semidefinite. A
-    small `alpha` costs no digits but those of the differences of `fn` themselves. A `cov` that is not
-    semidefinite gives NaN.
+    With ``n + lambda = 3`` the fourth moments along the axes are those of a Gaussian. The covariance is
+    positive semidefinite for ``beta >= alpha^2``, or ``kappa >= 0`` with ``alpha = 1``. A small `alpha`
+    costs no digits but those of the differences of `fn` themselves. A `cov` that is not semidefinite
+    gives NaN.
 
     Parameters
     ----------

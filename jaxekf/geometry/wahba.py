@@ -140,11 +140,14 @@ def _axial(profile: Array) -> Array:
 def _with_derivatives(q: Array, profile: Array) -> Array:
     """``q``, a constant, as a function of the `profile` that it solves.
 
-    For a rotation by ``d``, with ``S = R' profile``, the objective grows by ``d . axial(S) - d' M d /
-    2``, ``M`` being ``trace(S) I`` minus the symmetric part of ``S``. Steps ``inv(M) axial(S)``
-    change the value by rounding only. For a small change of `profile` with constant q, each step
-    makes the solution right to one more order in that change, with ``M`` constant as well: two steps
-    give first and second derivatives.
+    For a rotation by ``d``, with ``S = R' profile``, the objective grows by
+
+        d . axial(S) - d' M d / 2
+
+    with ``M`` being ``trace(S) I`` minus the symmetric part of ``S``. Steps ``inv(M) axial(S)`` change the
+    value by rounding only. For a small change of `profile` with constant q, each step makes the solution
+    right to one more order in that change, with ``M`` constant as well: two steps give first and second
+    derivatives.
     """
     now = linalg.multiply(rotation.to_matrix(q).T, lax.stop_gradient(profile))
     curvature = jnp.trace(now) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(now)

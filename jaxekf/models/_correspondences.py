@@ -63,8 +63,7 @@ class BilinearPoint(NamedTuple):
 
 
 def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
-    """Image points (N, 2 count) of the first `count` visible landmarks of each image; zeros in the
-    bilinear form."""
+    """Image points (N, 2 count) of the first `count` visible landmarks; zeros in the bilinear form."""
     stream = recording.need_camera()
     usable = stream.usable
     # The landmarks that are seen, in order, then others to fill up.
@@ -96,8 +95,7 @@ def _padded(values: Any, short: int) -> Any:
 
 
 def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
-    """Depths (N, M), m, of landmarks (N, M, 3), from the single-image pose of the nearest image with
-    one."""
+    """Depths (N, M), m, of landmarks (N, M, 3), from the pose of the nearest image that has one."""
     found = pnp.poses(stream)
     known = np.flatnonzero(found.valid)
     if known.size == 0:

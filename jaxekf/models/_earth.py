@@ -125,8 +125,10 @@ def thinned(imu: Imu, good: Flags) -> Indices:
 def attitudes(
     force: Floats, field: Floats, about: Setup, least_sine: float = 1e-6
 ) -> triad.Attitude:
-    """Attitudes (N, 4) from specific forces and fields (N, 3), valid if the sine of their angle is large
-    enough."""
+    """Attitudes (N, 4) from specific forces and fields (N, 3).
+
+    They are valid if the sine of the angle between the two is not below `least_sine`.
+    """
     return _attitudes(force, field, -about.gravity_ref, about.field_ref, least_sine)
 
 

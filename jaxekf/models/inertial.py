@@ -116,10 +116,13 @@ SETUP = Setup(np.array(GRAVITY_REF), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
     """Strapdown integration by mean rate and specific force over ``dt``, both constant in the body frame.
 
-    While the body rotates by ``theta`` the force rotates with it: its integrals over the step are ``f
-    + theta x f / 2 + theta x (theta x f) / 6`` times dt, and ``f / 2 + theta x f / 6 + theta x (theta
-    x f) / 24`` times dt^2, up to ``theta^3``. ``w`` holds noise of angle and velocity, and the
-    changes of both biases.
+    While the body rotates by ``theta`` the force rotates with it: its integrals over the step are, up to
+    ``theta^3``,
+
+        (f + theta x f / 2 + theta x (theta x f) / 6) dt
+        (f / 2 + theta x f / 6 + theta x (theta x f) / 24) dt^2
+
+    ``w`` holds noise of angle and velocity, and the changes of both biases.
     """
     force = params.calibration.accelerometer_matrix @ u.mean[3:] - x.accelerometer_bias
     turn = _rate(x, u.mean, params) * dt
@@ -163,8 +166,7 @@ def initial_mean(first: Any) -> State:
 
 
 def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
-    """Gravity vector (3,), m/s^2, in the reference frame: as stated, or estimated from the poses
-    `raw()`."""
+    """Gravity vector (3,), m/s^2, reference frame: stated, or estimated from the poses `raw()`."""
     stated = recording.info.get("gravity_ref")
     if stated is None:
         stated = marker_pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
@@ -172,8 +174,7 @@ def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
 
 
 def setup(recording: Recording, raw: Callable[[], Optical]) -> Setup:
-    """Gravity and object frame of a recording; gravity is estimated from the poses `raw()` if it is not
-    stated."""
+    """Gravity and object frame of a recording; gravity is estimated from `raw()` if it is not stated."""
     info = recording.info
     frame = np.asarray(info.get("q_body_object", SETUP.q_body_object), float)
     return Setup(

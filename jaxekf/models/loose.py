@@ -48,8 +48,10 @@ class Noise(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """Deterministic parameters: ``rate = exp(alignment) @ gyroscope_matrix @ (measured - bias -
-    noise)``."""
+    """Deterministic parameters.
+
+    ``rate = exp(alignment) @ gyroscope_matrix @ (measured - bias - noise)``.
+    """
 
     gyroscope_matrix: Any
     """Scale, non-orthogonality and rotation from the gyroscope's axes to the tool frame, (3, 3)."""
@@ -100,8 +102,7 @@ def process_noise(params: Parameters, dt: Array) -> Array:
 
 
 def angle_and_bias_noise(rate: Array, bias_walk: Array, dt: Array) -> Array:
-    """The covariance (6, 6) of `process_noise`, from the densities of the rate and of the bias
-    derivative."""
+    """The covariance (6, 6) of `process_noise` from the densities of rate and bias derivative."""
     white = linalg.covariance(rate, 3) * dt
     walk = linalg.covariance(bias_walk, 3)
     cross = -0.5 * walk * dt**2

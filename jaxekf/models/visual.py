@@ -197,8 +197,7 @@ def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
 
 
 def predict_bilinear(x: State, u: Any, params: Parameters, aux: BilinearPoint) -> Array:
-    """Eq. 11c: offset (2,), m, of the landmark from the ray of its image point, perpendicular to the
-    axis."""
+    """Eq. 11c: offset (2,), m, of the landmark from the ray of its image point."""
     p = in_camera(x, params, aux.p_ref_landmark)
     return p[:2] - pinhole.ray(lens_of(params), aux.pixel) * p[2]
 

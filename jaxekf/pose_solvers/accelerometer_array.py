@@ -88,8 +88,8 @@ def exact_readings(
 
 @jax.custom_jvp
 def _complement_projector(matrix: Array) -> tuple[Array, Array]:
-    """Projector (n, n) onto the orthogonal complement of the columns of `matrix` (n, 3), and its
-    pseudo-inverse.
+    """Projector (n, n) onto the complement of the columns of `matrix` (n, 3), and the pseudo-inverse (3,
+    n).
 
     Dependent columns are left out.
     """

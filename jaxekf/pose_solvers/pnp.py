@@ -150,8 +150,7 @@ def _for_all_images(found: Resection, images: Any, count: int) -> Resection:
 
 
 def no_pose_error(place: Path | str, images: int) -> RecordingError:
-    """Error for a camera without any valid pose: its lens or landmarks are wrong, another run would not
-    help."""
+    """Error for a camera without any valid pose, whose lens or landmarks are wrong."""
     return RecordingError(
         place,
         f"{images} images of {FEWEST} landmarks or more, none of which fits any pose",

@@ -37,8 +37,7 @@ _SLOWEST_MEAN = np.deg2rad(2.0)
 
 
 def integrated_attitude(imu: Imu) -> Floats:
-    """Quaternions (N, 4) from the body at each sample to the body at the first one, by the gyroscope
-    alone."""
+    """Quaternions (N, 4) from the body at each sample to the body at the first, by the gyroscope alone."""
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
     q = running_product(from_scipy(Rotation.from_rotvec(angle)))
@@ -46,11 +45,10 @@ def integrated_attitude(imu: Imu) -> Floats:
 
 
 def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
-    """Unit vectors (N, 3) of the vertical in the body frame: specific force, low-passed in a
-    non-rotating frame.
+    """Unit vectors (N, 3) of the vertical in the body frame.
 
-    The gyroscope's bias at rest is subtracted if the run has static intervals; otherwise the frame
-    would drift and the result lag by degrees.
+    The specific force is low-passed in a non-rotating frame. The gyroscope's bias at rest is subtracted if
+    the run has static intervals; otherwise the frame would drift and the result lag by degrees.
 
     Parameters
     ----------
@@ -79,10 +77,10 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
 
 
 def static_samples(imu: Imu) -> Flags:
-    """Mask (N,) of samples at the end of a static second: readings scatter as little as in the quietest
-    seconds.
+    """Mask (N,) of samples at the end of a static second.
 
-    The scatter of the quietest seconds is limited to a sensor's possible noise.
+    A second is static if its readings scatter as little as in the quietest seconds of the run, whose
+    scatter is limited to a sensor's possible noise.
     """
     width = max(2, int(_STILL_S * NANOSECONDS / max(period_ns(imu.time_ns), 1)))
     quiet = _quiet(imu.gyroscope, width, _STILL_RATE)
@@ -114,8 +112,7 @@ def magnetic_field(imu: Imu) -> MagneticField:
 
 
 def _quiet(values: Floats, width: int, most: float) -> Flags:
-    """Whether the last `width` of values (N, 3) scatter little more than the quietest, and less than
-    `most`."""
+    """Whether the last `width` of values (N, 3) scatter about as the quietest, and less than `most`."""
     values = values - values.mean(axis=0)
     spread = _trailing(values**2, width) - _trailing(values, width) ** 2
     deviation = np.sqrt(np.maximum(spread.max(axis=1), 0.0))

@@ -132,11 +132,10 @@ def _joined(bands: Floats) -> Floats:
 
 
 def angular_acceleration(motion: Motion, t: Floats) -> Floats:
-    """Angular acceleration (N, 3), rad/s^2, body frame, at times t (N,) in seconds, of a motion without
-    rest.
+    """Angular acceleration (N, 3), rad/s^2, body frame, of a motion without rest at times t (N,), s.
 
-    The derivative of ``rate = e_x a_x' + v a_y' + u a_z'``, with v and u the axes of the rotations
-    about y and z in the body frame: ``v = R_x' e_y`` and ``u = R_x' R_y' e_z``.
+    The derivative of ``rate = e_x a_x' + v a_y' + u a_z'``, with v and u the axes of the rotations about y
+    and z in the body frame: ``v = R_x' e_y`` and ``u = R_x' R_y' e_z``.
     """
     angle, speed = motion.angles(t)
     (x, y, _), (dx, dy, dz) = angle.T, speed.T
@@ -162,8 +161,7 @@ def angular_acceleration(motion: Motion, t: Floats) -> Floats:
 
 
 def specific_forces(motion: ToolMotion, array: AccelerometerArray, t: Floats) -> Floats:
-    """Specific force along each axis of an array (N, n), m/s^2, by rigid-body motion, at times t (N,) in
-    seconds."""
+    """Specific force along each axis of an array (N, n), m/s^2, at times t (N,), s."""
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - GRAVITY_REF)
     acceleration = angular_acceleration(motion.attitude, t)

@@ -16,8 +16,7 @@ GRAVITY_REF = np.array(constants.GRAVITY_REF)
 
 @dataclass(frozen=True)
 class ToolGrade:
-    """Noise and rates of IMU and tracker; the defaults are an ADIS16350 and the tracker of Tobergte
-    (2009)."""
+    """Noise and rates of IMU and tracker; the defaults are an ADIS16350 and Tobergte's tracker (2009)."""
 
     gyroscope_deg: float = 0.05
     """White noise of the rate, deg/s/sqrt(Hz)."""
@@ -147,8 +146,7 @@ def tool_recording(
     hidden: Hidden = (),
     start_ns: int = 0,
 ) -> Recording:
-    """Record a motion as single markers, stamped on arrival, with an IMU and the true pose at the IMU's
-    times.
+    """Record a motion as single markers, with an IMU and the true pose at the IMU's times.
 
     Parameters
     ----------
@@ -167,7 +165,8 @@ def tool_recording(
     hidden
         Occlusions of single markers.
     start_ns
-        Time of the first samples, ns; the first frame is taken then and arrives later by the latency.
+        Time of the first samples, ns; the first frame is taken then, and arrives and is stamped later by
+        the latency.
     """
     return tool_run(
         name,

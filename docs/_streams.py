@@ -29,7 +29,7 @@ def _units(unit: str) -> str:
 def _section(schema: StreamSchema) -> list[str]:
     """One stream: files, arrays and entries of its section."""
     headers = " or ".join(_code(layout) for layout in schema.layouts)
-    where = "" if schema.name in STREAMS else f" In Python: `Recording.others[\"{schema.name}\"]`."
+    where = "" if schema.name in STREAMS else f' In Python: `Recording.others["{schema.name}"]`.'
     lines = [f"### {schema.name}", "", schema.about + where, ""]
     lines += [f"Header of `{schema.name}.csv`: {headers}", ""]
     rows = [

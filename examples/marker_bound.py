@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.recordings.types import Floats, to_scipy
 from jaxekf.simulation.marker_runs import GRAVITY_REF, Hidden, Tool, ToolGrade, ToolMotion
 
@@ -86,7 +87,7 @@ def bound(
     per_s = np.zeros(15)
     per_s[_TILT], per_s[_SPEED] = (
         np.deg2rad(grade.gyroscope_deg),
-        9.80665e-3 * grade.accelerometer_mg,
+        1e-3 * STANDARD_GRAVITY * grade.accelerometer_mg,
     )
     per_s[_GYRO], per_s[_ACCEL] = np.deg2rad(grade.bias_walk_deg), grade.accelerometer_walk
     noise = np.diag(per_s**2) * dt

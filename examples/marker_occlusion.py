@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import jax
 
 import jaxekf
+from jaxekf._support.constants import STANDARD_GRAVITY
 
 jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 jaxekf.set_up()
@@ -61,7 +62,7 @@ def model_parameters(grade: ToolGrade) -> jaxekf.Parameters:
     params = tight.MODEL.parameters
     noise = tight.Noise(
         gyroscope=np.deg2rad(grade.gyroscope_deg),
-        accelerometer=9.80665e-3 * grade.accelerometer_mg,
+        accelerometer=1e-3 * STANDARD_GRAVITY * grade.accelerometer_mg,
         bias_walk=np.deg2rad(grade.bias_walk_deg),
         accelerometer_walk=grade.accelerometer_walk,
         marker=1e-3 * grade.marker_mm,

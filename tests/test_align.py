@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import jaxekf
 from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.calibration import time_offset
-from jaxekf.calibration.alignment import align, align_run, calibration_for, poses, together
+from jaxekf.calibration.alignment import align, align_run, calibration_for, combine_runs, poses
 from jaxekf.calibration.attitude_alignment import refine
 from jaxekf.cli import main
 from jaxekf.estimation import parameters
@@ -102,17 +102,17 @@ def test_outliers_occlusions_and_gaps_do_not_count():
 
 def test_runs_together(aligned):
     """A mean without weights, and a chi-square that calls good runs bad, or bad ones good."""
-    mean = together(aligned)
+    mean = combine_runs(aligned)
     assert abs(mean.latency_s - 0.2) < 4.0 * mean.latency_sigma_s < 4e-4
     assert mean.latency_sigma_s < min(run.tracker.latency_sigma_s for run in aligned)
     assert np.all(np.abs(off_turn(mean)) < np.deg2rad(0.04))
     assert mean.latency_p > 0.01 and mean.alignment_p > 0.01 and mean.sentences() == ()
     other = align_run(planted(9, 40.0, latency_s=0.21, turn=1.3 * TURN))
-    apart = together([*aligned, other])
+    apart = combine_runs([*aligned, other])
     assert apart.latency_p < 1e-6 and apart.alignment_p < 1e-6
     assert len(apart.sentences()) == 2
     assert apart.latency_sigma_s > 2.0 * mean.latency_sigma_s
-    one = together(aligned[:1])
+    one = combine_runs(aligned[:1])
     assert one.latency_s == pytest.approx(aligned[0].tracker.latency_s, abs=1e-12)
     assert np.isnan(one.latency_p) and one.sentences() == ()
 
@@ -124,7 +124,7 @@ def test_one_axis_does_not_tell_the_alignment():
     run = align_run(planted(0, 40.0, replace(motion, amplitude=amplitude), latency_s=0.02))
     assert abs(run.tracker.latency_s - 0.02) < 1e-3
     model = jaxekf.get_model("loose_pose")
-    params, sentences = calibration_for(model, together([run]))
+    params, sentences = calibration_for(model, combine_runs([run]))
     assert "is not set" in sentences[0]
     assert np.all(params.calibration.alignment == 0.0)
     assert params.calibration.latency == pytest.approx(0.02, abs=1e-3)
@@ -145,7 +145,7 @@ def test_what_does_not_belong_together_is_refused():
     with pytest.raises(RecordingError, match="clocks that do not jump"):
         refine(jumped, imu, start)
     with pytest.raises(ModelError, match="no clock to calibrate"):
-        calibration_for(jaxekf.get_model("loose_rate"), together([align_run(planted(1, 40.0))]))
+        calibration_for(jaxekf.get_model("loose_rate"), combine_runs([align_run(planted(1, 40.0))]))
 
 
 def test_real_lag_of_the_gyroscope(data_dir):
@@ -234,11 +234,11 @@ def test_drift_for_a_model_that_has_one():
     model = replace(loose, parameters=able)
     run = align_run(planted(3, 60.0, latency_s=0.2, drift=100e-6))
     assert "drifts against the IMU's by" in run.notes[0]
-    told = calibration_for(model, together([run]))[0].calibration
+    told = calibration_for(model, combine_runs([run]))[0].calibration
     assert told.clock_drift == pytest.approx(-100e-6, abs=25e-6)
     assert told.clock_offset == pytest.approx(-(0.2 - 30.0 * 100e-6), abs=1e-3)
     assert told.clock_offset == pytest.approx(-0.2 - 30.0 * told.clock_drift, abs=5e-4)
     steady = align_run(planted(3, 60.0, latency_s=0.2))
-    told = calibration_for(model, together([steady]))[0].calibration
+    told = calibration_for(model, combine_runs([steady]))[0].calibration
     assert told.clock_drift == 0.0
     assert told.clock_offset == pytest.approx(-steady.tracker.latency_s, abs=1e-12)

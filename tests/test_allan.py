@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxekf
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration import allan, static_interval
 from jaxekf.calibration.noise_densities import fit
@@ -86,7 +87,7 @@ def test_planted_densities_are_found():
     for truth, made in ((white, [f.white for f in found]), (walk, [f.walk for f in found])):
         assert np.mean([m.value for m in made]) == pytest.approx(truth, rel=0.1)
         assert 0.90 <= np.mean([m.low <= truth <= m.high for m in made]) <= 0.99
-    assert np.mean([f.walk.found for f in found]) > 0.9
+    assert np.mean([f.walk.significant for f in found]) > 0.9
     assert np.mean([f.flicker > 0.0 for f in found]) < 0.05
     assert np.median([f.deviation(np.ones(1))[0] for f in found]) == pytest.approx(
         np.sqrt(white**2 + walk**2 / 3.0), rel=0.05
@@ -106,8 +107,8 @@ def test_flicker_is_told_from_a_walk():
     found = fit(values + samples(6, count, 0.2, 0.0), PERIOD_S)
     assert found.flicker == pytest.approx(1.0, rel=0.12)
     assert found.white.value == pytest.approx(0.2, rel=0.1)
-    assert not found.walk.found or found.walk.value < 0.1 * found.walk_alone.value
-    assert found.walk_alone.found
+    assert not found.walk.significant or found.walk.value < 0.1 * found.walk_alone.value
+    assert found.walk_alone.significant
 
 
 def test_low_pass_and_vibration_do_not_count():
@@ -128,7 +129,7 @@ def test_a_short_rest_does_not_tell_a_walk():
     model = jaxekf.get_model("loose")
     start = start_for(model, found)
     assert set(start.taken) == {"gyroscope", "optical"}
-    assert "do not tell a random walk" in start.sentences[0]
+    assert "too short to estimate a random walk" in start.sentences[0]
     assert start.params.noise.bias_walk == model.parameters.noise.bias_walk
     np.testing.assert_allclose(start.params.noise.gyroscope, np.deg2rad(0.05), rtol=0.06)
     wide = model.parameters.noise._replace(bias_walk=np.deg2rad(1.0))
@@ -170,7 +171,7 @@ def test_what_does_not_rest_is_refused():
     """Noise of a motion: one that begins at once, and a steady turn, which looks like a bias."""
     with pytest.raises(RecordingError, match="of rest at the start"):
         static_interval.static_head(still(0, rest_s=1.0))
-    with pytest.raises(RecordingError, match="tracker that turns by"):
+    with pytest.raises(RecordingError, match="tracker that rotates by"):
         static_interval.static_head(still(0, motion=attitude_runs.constant_rate_motion(-1.0, 0.0)))
     with pytest.raises(RecordingError, match="stretch from 30"):
         static_noise(still(0), 30.0, 40.0)
@@ -216,12 +217,12 @@ def test_command_writes_a_start_for_tuning(tool, tmp_path):
     model = jaxekf.get_model("tight")
     noise = parameters.load(model, tmp_path / "out").noise
     np.testing.assert_allclose(noise.gyroscope, np.deg2rad(0.05), rtol=0.06)
-    np.testing.assert_allclose(noise.accelerometer, 1.85e-3 * 9.80665, rtol=0.06)
+    np.testing.assert_allclose(noise.accelerometer, 1.85e-3 * STANDARD_GRAVITY, rtol=0.06)
     np.testing.assert_allclose(noise.marker, 0.231e-3, rtol=0.06)
     table = np.genfromtxt(tmp_path / "out" / "allan.csv", delimiter=",", names=True)
     assert table.dtype.names[:3] == ("tau_s", "gyroscope_x_rad_s", "gyroscope_x_low_rad_s")
     near = np.argmin(np.abs(table["tau_s"] - 0.1))
-    expected = 1.85e-3 * 9.80665 / np.sqrt(table["tau_s"][near])
+    expected = 1.85e-3 * STANDARD_GRAVITY / np.sqrt(table["tau_s"][near])
     assert table["accelerometer_z_m_s2"][near] == pytest.approx(expected, rel=0.15)
     assert (tmp_path / "out" / "allan.png").stat().st_size > 20_000
     assert not (tmp_path / "out" / "calibration.toml").exists()

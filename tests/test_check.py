@@ -174,16 +174,20 @@ CAMERA_FAULTS = {
         'stating [camera] unit = "mm, px"',
         "faults",
     ),
-    "scale": (lambda c: {"p_ref_landmark": 1.3 * c.p_ref_landmark}, "places to scale", "warnings"),
+    "scale": (
+        lambda c: {"p_ref_landmark": 1.3 * c.p_ref_landmark},
+        "positions to scale",
+        "warnings",
+    ),
     "images of half the size": (
         lambda c: {"pixel": 0.5 * c.pixel},
-        "of the camera's turning: are both of one run",
+        "of the camera's rotation: are both of one run",
         "warnings",
     ),
     "late": (lambda c: {"time_ns": c.time_ns + 40_000_000}, "the images are 40.", "warnings"),
     "turned": (
         lambda c: {"q_body_camera": np.full(4, 0.5)},
-        "the camera is turned by 120.",
+        "the camera is rotated by 120.",
         "warnings",
     ),
 }
@@ -231,7 +235,7 @@ def test_a_gyroscope_in_degrees_beside_a_camera(eight):
 def test_gravity_the_other_way_round_beside_a_camera(eight):
     """Would catch gravity_ref that points up, of a run whose only poses are those of images."""
     (said,) = inspect(eight.replace(info={"gravity_ref": [9.81, 0.0, 0.0]})).faults
-    assert "free fall that is 1" in said and "expected about [-9.9" in said
+    assert "gravity vector 1" in said and "expected about [-9.9" in said
 
 
 def test_a_tracker_of_12_5_hz_is_compared():
@@ -267,7 +271,7 @@ def test_what_is_warned_of():
     assert "1 gaps of more than 0.5 s" in inspect(run.replace(imu=gap)).warnings[0]
     still = attitude_runs.recording("rest", attitude_runs.Motion(), seed=0, duration_s=10.0)
     found = inspect(still.replace(encoder=None))
-    assert found.alignment is None and "little turning" in found.warnings[0]
+    assert found.alignment is None and "little rotation" in found.warnings[0]
 
 
 GAPS = {1: (28, 3.4, 1.06), 3: (80, 15.0, 1.99), 4: (36, 2.7, 0.48)}

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxekf._support import compilation
 from jaxekf.pose_solvers.accelerometer_array import (
     AccelerometerArray,
-    _left_out,
+    _complement_projector,
     differences,
     exact_readings,
     three_dual_axis,
@@ -377,7 +377,9 @@ def test_derivative_of_the_projection_at_a_lower_rank():
         return np.eye(7) - path(t) @ inverse, inverse
 
     change = tall_change @ wide + tall @ wide_change
-    value, slope = compilation.jit(lambda m, d: jax.jvp(_left_out, (m,), (d,)))(path(0.0), change)
+    value, slope = compilation.jit(lambda m, d: jax.jvp(_complement_projector, (m,), (d,)))(
+        path(0.0), change
+    )
     step = 1e-5
     for got, there, ahead, behind, rate in zip(
         value, by_numpy(0.0), by_numpy(step), by_numpy(-step), slope, strict=True

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxekf
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.evaluation import metrics
@@ -103,7 +104,7 @@ def test_noise_of_an_attitude_is_that_of_its_vectors():
 
 def turning(rate):
     """An input that turns at a constant rate (3,) and feels gravity."""
-    value = jnp.concatenate([jnp.asarray(rate), jnp.array([0.0, 0.0, 9.80665])])
+    value = jnp.concatenate([jnp.asarray(rate), jnp.array([0.0, 0.0, STANDARD_GRAVITY])])
     return InputSample(value, value, jnp.array(100.0))
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import STANDARD_GRAVITY as GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.models import _earth as earth
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import NANOSECONDS, Imu, Recording, to_scipy
 from jaxekf.simulation import attitude_runs
 
-GRAVITY = 9.80665
 UP = np.array([0.0, 0.0, 1.0])
 DIP = np.deg2rad(63.0)
 FIELD = 48.0 * earth.dipping(UP, np.array([0.0, 1.0, 0.0]), DIP)
@@ -80,7 +80,7 @@ def test_turned_is_the_product_of_all_turns(count):
             mean = 0.5 * (rate[i] + rate[i - 1])
             q = q * Rotation.from_rotvec(mean * (time_ns[i] - time_ns[i - 1]) / NANOSECONDS)
         expected.append(q.as_quat())
-    found = tilt.turned(Imu(time_ns, rate))
+    found = tilt.integrated_attitude(Imu(time_ns, rate))
     assert apart(Rotation.from_quat(expected), to_scipy(found)) < 1e-12
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-14)
 
@@ -91,7 +91,7 @@ def test_turned_follows_a_known_motion():
     motion, errors = attitude_runs.free_motion(0, rest_s=0.0), []
     for hertz in (125.0, 250.0):
         imu, truth = carried(motion, times(hertz, 60.0))
-        errors.append(apart(truth[0].inv() * truth, to_scipy(tilt.turned(imu))))
+        errors.append(apart(truth[0].inv() * truth, to_scipy(tilt.integrated_attitude(imu))))
     assert errors[0] < np.deg2rad(0.02)
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
 
@@ -151,18 +151,18 @@ def test_rest_is_told_from_motion():
     motion = attitude_runs.free_motion(0, rest_s=20.0)
     imu, _ = carried(motion, times(100.0, 60.0), 0.0, noise)
     t = attitude_runs.seconds(imu.time_ns)
-    found = tilt.still(imu)
+    found = tilt.static_samples(imu)
     assert not found[t < 0.98].any()
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 20.3].any()
     turning = attitude_runs.Motion(rate=(0.0, 0.0, np.deg2rad(3.0)), rest_s=20.0)
     steady, _ = carried(turning, times(100.0, 60.0), 0.0, noise)
-    found = tilt.still(steady)
+    found = tilt.static_samples(steady)
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 21.0].any()
     level = resting(len(t))
     force = level.accelerometer + np.where(t[:, None] > 20.0, shaken(t, 1.0), 0.0)
-    found = tilt.still(replace(level, accelerometer=force))
+    found = tilt.static_samples(replace(level, accelerometer=force))
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 21.0].any()
 
@@ -182,7 +182,7 @@ def test_rest_is_found_again():
     """A window that grows from the start of the run, in which the motion is for ever."""
     motion = Stopping(attitude_runs.free_motion(0, rest_s=20.0))
     imu, _ = carried(motion, times(100.0, 60.0), 0.0, (2e-3, 0.02, 0.0))
-    t, found = attitude_runs.seconds(imu.time_ns), tilt.still(imu)
+    t, found = attitude_runs.seconds(imu.time_ns), tilt.static_samples(imu)
     assert found[((t > 1.0) & (t < 20.0)) | (t > 41.2)].mean() > 0.95
     assert not found[(t > 20.5) & (t < 40.9)].any()
 
@@ -196,18 +196,18 @@ def test_gentle_and_quick_motion_is_none(axis):
     own = 2e-4 * rng.standard_normal((len(t), 3))
     moves = np.eye(3)[axis] * np.sqrt(2.0) * np.sin(2.0 * np.pi * 8.3 * t)[:, None]
     gentle = own + np.where(t[:, None] > 20.0, np.deg2rad(0.3) * moves, 0.0)
-    found = tilt.still(Imu(time_ns, gentle))
+    found = tilt.static_samples(Imu(time_ns, gentle))
     assert found[(t > 1.0) & (t < 20.0)].mean() > 0.95
     assert not found[t > 20.5].any()
-    assert not tilt.still(Imu(time_ns, own + np.deg2rad(3.0) * moves)).any()
+    assert not tilt.static_samples(Imu(time_ns, own + np.deg2rad(3.0) * moves)).any()
 
 
 def test_a_run_that_never_rests():
     """The quietest seconds of a motion taken for rest, for want of better ones."""
     for seed in range(5):
         imu, _ = carried(attitude_runs.free_motion(seed, rest_s=0.0), times(100.0, 60.0))
-        assert not tilt.still(imu).any()
-        assert not tilt.still(Imu(imu.time_ns, imu.gyroscope)).any()
+        assert not tilt.static_samples(imu).any()
+        assert not tilt.static_samples(Imu(imu.time_ns, imu.gyroscope)).any()
 
 
 @pytest.mark.parametrize("gap_s", [0.5, 5.0])
@@ -218,7 +218,7 @@ def test_rest_over_a_gap(gap_s):
     there = (t < 10.0) | (t >= 10.0 + gap_s)
     there &= np.random.default_rng(0).random(len(t)) > 0.05
     kept = {key: getattr(imu, key)[there] for key in imu.per_sample}
-    found = tilt.still(Imu(imu.time_ns[there], **kept))
+    found = tilt.static_samples(Imu(imu.time_ns[there], **kept))
     late = (t[there] > 1.2) & ((t[there] < 10.0) | (t[there] > 11.2 + gap_s))
     assert found[late].mean() > 0.95
 
@@ -227,33 +227,33 @@ def test_rest_over_a_gap(gap_s):
 def test_short_runs(count):
     """An error, or rest that nobody has seen for a second."""
     imu = resting(count)
-    found = tilt.still(imu)
+    found = tilt.static_samples(imu)
     assert found.shape == (count,) and not found[:99].any()
     assert found[99:].all()
     up = tilt.up_in_body(imu)
     expected = np.tile(MOUNT.inv().apply(UP), (count, 1))
     assert np.rad2deg(angles(up, expected).max()) < 1.0
-    assert np.isfinite(tilt.field(imu).dip).all()
+    assert np.isfinite(tilt.magnetic_field(imu).dip).all()
 
 
 def test_readings_that_do_not_scatter():
     """No rest where readings repeat to the last bit, because none scatters less than the quietest: of a
     simulated sensor without noise, and of one that is rounded coarsely."""
-    assert tilt.still(resting(1000, (0.0, 0.0, 0.0)))[99:].all()
+    assert tilt.static_samples(resting(1000, (0.0, 0.0, 0.0)))[99:].all()
     fine = resting(6000, (3e-4, 5e-3, 0.0))
     coarse = replace(
         fine,
         gyroscope=1e-3 * np.round(fine.gyroscope / 1e-3),
         accelerometer=0.02 * np.round(fine.accelerometer / 0.02),
     )
-    assert tilt.still(coarse)[99:].mean() > 0.98
+    assert tilt.static_samples(coarse)[99:].mean() > 0.98
 
 
 def test_the_field_is_felt():
     """A dip above the horizontal, or one against the specific force of a shaken hand."""
     imu, _ = carried(attitude_runs.free_motion(2), times(100.0, 60.0), 2.0, (1e-3, 0.02, 0.3))
     late = attitude_runs.seconds(imu.time_ns) > 5.0
-    norm, dip = tilt.field(imu)
+    norm, dip = tilt.magnetic_field(imu)
     assert np.median(norm) == pytest.approx(48.0, abs=0.1)
     assert np.median(dip[late]) == pytest.approx(DIP, abs=np.deg2rad(0.2))
     assert np.std(dip[late]) < np.deg2rad(1.0)
@@ -264,16 +264,16 @@ def test_a_slower_magnetometer_spoils_no_other_sample(blank):
     """NaN that goes from samples that were not read to those that were, or zeros that stand for them taken
     for a field."""
     imu, _ = carried(attitude_runs.free_motion(2), times(100.0, 20.0), 2.0)
-    whole = tilt.field(imu)
+    whole = tilt.magnetic_field(imu)
     read = np.arange(len(imu.time_ns)) % 4 == 1
     slower = np.where(read[:, None], imu.magnetometer, blank)
-    found = tilt.field(replace(imu, magnetometer=slower))
+    found = tilt.magnetic_field(replace(imu, magnetometer=slower))
     for a, b in zip(found, whole, strict=True):
         np.testing.assert_array_equal(a[read], b[read])
         assert np.isnan(a[~read]).all()
     half = imu.magnetometer.copy()
     half[7, 1] = np.nan
-    found = tilt.field(replace(imu, magnetometer=half))
+    found = tilt.magnetic_field(replace(imu, magnetometer=half))
     assert np.flatnonzero(np.isnan(found.dip)).tolist() == [7]
 
 
@@ -336,12 +336,12 @@ def test_a_field_without_a_north_is_refused(info, words):
 def test_both_sensors_are_needed(sensor):
     """A traceback, or an attitude out of a sensor that is not there."""
     imu = resting(200)
-    assert earth.need_both(recording({}, imu)) is imu
+    assert earth.require_marg_imu(recording({}, imu)) is imu
     for value in (None, np.full((200, 3), np.nan), np.zeros((200, 3))):
         with pytest.raises(RecordingError, match=f"an IMU without {sensor}"):
-            earth.need_both(recording({}, replace(imu, **{sensor: value})))
+            earth.require_marg_imu(recording({}, replace(imu, **{sensor: value})))
     with pytest.raises(RecordingError, match="no imu stream"):
-        earth.need_both(Recording("run"))
+        earth.require_marg_imu(Recording("run"))
 
 
 def test_samples_that_are_not_finite_are_left_out():
@@ -351,10 +351,10 @@ def test_samples_that_are_not_finite_are_left_out():
         spoilt = getattr(imu, key).copy()
         spoilt[row, 1] = np.nan
         imu = replace(imu, **{key: spoilt})
-    left = earth.need_both(recording({}, imu))
+    left = earth.require_marg_imu(recording({}, imu))
     assert np.setdiff1d(imu.time_ns, left.time_ns).tolist() == imu.time_ns[[500, 600]].tolist()
-    assert np.isnan(tilt.field(left).dip).sum() == 1
-    assert tilt.still(left)[99:].mean() > 0.98
+    assert np.isnan(tilt.magnetic_field(left).dip).sum() == 1
+    assert tilt.static_samples(left)[99:].mean() > 0.98
     assert earth.setup(recording({}, imu)).field_ref[2] == pytest.approx(-np.sin(DIP), abs=0.01)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks import plausibility
 from jaxekf.io.importers import asl, broad
@@ -92,9 +93,9 @@ FAULTS = {
     "rad/s": (lambda run: scaled(run, rate=1 / DEGREES), r'0\.017.*unit = "rad/s, m/s\^2"'),
     "mm": (lambda run: moved(run, 1e3), r'\d{3,4}(\.\d)? times as far .*unit = "1, mm"'),
     "m": (lambda run: moved(run, 1e-3), r'0\.00\d+ times as far.*unit = "1, m"'),
-    "g": (lambda run: scaled(run, force=1 / 9.80665), 'unit = "rad/s, g"'),
-    "not g": (lambda run: scaled(run, force=9.80665), r'unit = "rad/s, m/s\^2"'),
-    "deg/s and g": (lambda run: scaled(run, DEGREES, 1 / 9.80665), 'unit = "deg/s, g"'),
+    "g": (lambda run: scaled(run, force=1 / STANDARD_GRAVITY), 'unit = "rad/s, g"'),
+    "not g": (lambda run: scaled(run, force=STANDARD_GRAVITY), r'unit = "rad/s, m/s\^2"'),
+    "deg/s and g": (lambda run: scaled(run, DEGREES, 1 / STANDARD_GRAVITY), 'unit = "deg/s, g"'),
     "no gravity": (weightless, "gravity is removed"),
     "apart": (apart, r"optical from .* to .* imu from 1000\.000 to 1030\.000 s.*overlap"),
 }
@@ -239,7 +240,7 @@ def test_gravity_the_other_way_round():
         optical=None,
         imu=replace(still.imu, accelerometer=np.tile(-fall, (len(run.imu.time_ns), 1))),
     )
-    for size, said in ((1.0 / 9.80665, "free fall of 1 m/s"), (1e3, "free fall of 9.8")):
+    for size, said in ((1.0 / STANDARD_GRAVITY, "gravity of 1 m/s"), (1e3, "gravity of 9.8")):
         with pytest.raises(RecordingError, match=f"{said}.*about 9.8"):
             plausibility.require(still.replace(info={"gravity_ref": list(size * fall)}))
 

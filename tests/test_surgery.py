@@ -11,6 +11,7 @@ from scenario import LONG
 from scipy.signal import welch
 
 from jaxekf._support import compilation
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray, exact_readings
 from jaxekf.pose_solvers.gyro_free_rate import track
 from jaxekf.recordings.types import to_scipy
@@ -106,7 +107,7 @@ def test_acceleration_switched_off():
     norm = np.linalg.norm(
         surgery.mean_force(ARRAY, surgery.specific_forces(still, ARRAY, t)), axis=1
     )
-    assert np.abs(norm - 9.80665).max() < 2e-3
+    assert np.abs(norm - STANDARD_GRAVITY).max() < 2e-3
 
 
 def test_noise_densities():
@@ -118,7 +119,7 @@ def test_noise_densities():
     noise = run.readings - surgery.specific_forces(motion, ARRAY, t)
     # The density of a two-sided spectrum, as everywhere here: half the one-sided of `welch`.
     frequency, density = welch(noise, GRADE.hertz, nperseg=1024, axis=0)
-    expected = (110e-6 * 9.80665) ** 2
+    expected = (110e-6 * STANDARD_GRAVITY) ** 2
     for low, high in ((1.0, 30.0), (100.0, 150.0), (200.0, 249.0)):
         inside = (frequency > low) & (frequency < high)
         np.testing.assert_allclose(0.5 * density[inside].mean(axis=0), expected, rtol=0.06)
@@ -214,7 +215,7 @@ def test_claims_of_the_example(example, runs):
     assert 0.9 < found["no_acceleration"]["nees"] < 1.1
     # TRIAD takes the force for gravity: its error about a level axis is that of the other component.
     pushed = surgery.surgical_motion(0).acceleration(np.arange(0.0, 60.0, 0.01)).std(axis=0)
-    expected = np.hypot(pushed, GRADE.acceleration_sigma / np.sqrt(2.0))[[1, 0]] / 9.80665
+    expected = np.hypot(pushed, GRADE.acceleration_sigma / np.sqrt(2.0))[[1, 0]] / STANDARD_GRAVITY
     truth = to_scipy(runs[0].recording.need_encoder().q_ref_body)
     level = truth.apply(example.triad_error(runs[0].recording))[:, :2].std(axis=0)
     np.testing.assert_allclose(level, expected, rtol=0.05)

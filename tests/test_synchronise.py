@@ -51,7 +51,7 @@ def test_what_does_not_turn_is_refused():
     at_rest = replace(
         imu, gyroscope=1e-3 * np.random.default_rng(2).standard_normal(imu.gyroscope.shape)
     )
-    with pytest.raises(RecordingError, match="so little turning"):
+    with pytest.raises(RecordingError, match="too little rotation"):
         time_offset.match(replace(still, q_ref_body=from_scipy(noisy)), at_rest)
     with pytest.raises(RecordingError, match="pairs of tracker samples"):
         time_offset.match(replace(optical, valid=np.zeros(len(optical.time_ns), bool)), imu)

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 import jaxekf
 import tuning
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.estimation import causal, padding, timeline
 from jaxekf.estimation.parameters import as_arrays
@@ -31,7 +32,7 @@ def matched(grade=COARSE):
     params = tight.MODEL.parameters
     noise = params.noise._replace(
         gyroscope=np.deg2rad(grade.gyroscope_deg),
-        accelerometer=9.80665e-3 * grade.accelerometer_mg,
+        accelerometer=1e-3 * STANDARD_GRAVITY * grade.accelerometer_mg,
         bias_walk=np.deg2rad(grade.bias_walk_deg),
         accelerometer_walk=grade.accelerometer_walk,
         marker=1e-3 * grade.marker_mm,

@@ -25,5 +25,11 @@ def sf(value: Any, degrees: Any) -> Any:
     return chdtrc(_positive(degrees), np.maximum(value, 0.0))
 
 
+def deviation_interval(deviation: Any, degrees: Any) -> tuple[Any, Any]:
+    """The 95 % confidence interval of a standard deviation estimated with these degrees of freedom."""
+    low, high = (deviation * np.sqrt(degrees / ppf(share, degrees)) for share in (0.975, 0.025))
+    return low, high
+
+
 def _positive(degrees: Any) -> Any:
     return np.where(np.greater(degrees, 0), degrees, np.nan)

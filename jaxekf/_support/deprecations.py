@@ -1,4 +1,4 @@
-"""Old names: modules are found under them for one release, with a `DeprecationWarning`."""
+"""Old names of modules and functions: valid for one release, with a `DeprecationWarning`."""
 
 import sys
 import warnings
@@ -201,3 +201,24 @@ def keep_old_names() -> None:
     """Find modules under their old names from now on."""
     if not any(isinstance(finder, _OldNames) for finder in sys.meta_path):
         sys.meta_path.insert(0, _OldNames())  # pyright: ignore[reportArgumentType]
+
+
+def renamed(module: str, names: str) -> Callable[[str], Any]:
+    """``__getattr__`` of `module` that finds its old names.
+
+    `names` are "old>new", or "old>package.module.new" if the name left the module, separated by blanks.
+    """
+    places = dict(entry.split(">") for entry in names.split())
+
+    def __getattr__(name: str) -> Any:
+        if name not in places:
+            raise AttributeError(f"module '{module}' has no attribute '{name}'", name=name)
+        home, _, new = places[name].rpartition(".")
+        warnings.warn(
+            f"{module}.{name} is now {home or module}.{new}; the old name will be gone in the next release",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(import_module(home or module), new)
+
+    return __getattr__

@@ -1,4 +1,9 @@
-"""Clock and frame of the trackers of several runs against their IMUs, and whether the runs agree."""
+"""Clock and rotation of trackers relative to their IMUs, run by run and combined.
+
+`align_run` estimates latency, drift and tracker-to-IMU rotation of one run, `combine_runs` forms the
+weighted mean and tests whether the runs agree, `calibration_for` writes the result into a model's
+parameters.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -7,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support import chi_square
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.calibration.attitude_alignment import AttitudeMatch, refine
 from jaxekf.calibration.time_offset import match
@@ -15,7 +21,7 @@ from jaxekf.pose_solvers.marker_pose import fit_markers, from_markers
 from jaxekf.recordings.types import Floats, Imu, Optical, Recording
 
 _DRIFTS = 3.0
-"""Deviations from which on a drift is believed."""
+"""Standard deviations from which a drift is significant."""
 _MATTERS_S = 1e-3
 _LATE_S, _SIGMAS = 2e-3, 3.0
 _TURNED = np.deg2rad(1.0)
@@ -24,56 +30,56 @@ _AGREE = 0.01
 
 
 class RunAlignment(NamedTuple):
-    """What one run tells."""
+    """Estimates of one run."""
 
     run: str
     tracker: AttitudeMatch
     encoder: AttitudeMatch | None
-    """None where there is no encoder of an attitude, or it does not tell."""
+    """None without an encoder of an attitude, or if its alignment could not be estimated."""
     notes: tuple[str, ...]
 
 
-class Together(NamedTuple):
-    """Several runs as one: means by weight, and whether the runs agree with them."""
+class CombinedAlignment(NamedTuple):
+    """Weighted means over several runs, and chi-square tests of whether the runs agree."""
 
     runs: int
     latency_s: float
     latency_sigma_s: float
-    """Widened where the runs do not agree."""
+    """Standard deviation, s; inflated if the runs disagree."""
     latency_chi2: float
     latency_p: float
-    """Probability of a chi-square as large or larger; NaN of one run."""
+    """P-value of the chi-square; NaN for one run."""
     alignment: Floats
-    """(3,) rotation vector, rad, that takes vectors of the tracked frame into the IMU's."""
+    """(3,) rotation vector, rad, tool frame to IMU frame."""
     alignment_cov: Floats
-    """(3, 3) rad^2, as in `AttitudeMatch`; widened where the runs do not agree."""
+    """(3, 3) rad^2, as in `AttitudeMatch`; inflated if the runs disagree."""
     alignment_chi2: float
     alignment_p: float
     drift: float
-    """By which the latency grows in a second; NaN where no run tells."""
+    """Growth of the latency, s/s; NaN if no run is long enough."""
     drift_sigma: float
     start_latency_s: float
-    """At the start of a run, by that drift; `latency_s` is that of its middle."""
+    """Latency at the start of a run under that drift; `latency_s` is that of the middle."""
 
     @property
-    def drifts(self) -> bool:
-        """Whether the drift is told from nothing."""
+    def has_drift(self) -> bool:
+        """Whether the drift is significant."""
         return abs(self.drift) > _DRIFTS * self.drift_sigma
 
     def sentences(self) -> tuple[str, ...]:
-        """What speaks against one clock and one frame for all."""
+        """Warnings if the runs disagree in clock or frame."""
         found = []
         for what, p in (("latency", self.latency_p), ("alignment", self.alignment_p)):
             if p < _AGREE:
                 found.append(
-                    f"the runs do not agree in {what} (chi-square, p = {p:.1g}): the mean's deviation is"
-                    " widened; calibrate them one by one where they differ by more than can be borne"
+                    f"the runs disagree in {what} (chi-square test, p = {p:.1g}): the standard"
+                    " deviation of the mean is inflated; calibrate the runs one by one if it matters"
                 )
         return tuple(found)
 
 
 def poses(recording: Recording) -> Optical:
-    """The tracker's poses, or those that its single markers give."""
+    """The tracker's poses, or those computed from its single markers."""
     if recording.optical is not None or recording.markers is None:
         return recording.need_optical()
     markers = recording.markers
@@ -81,18 +87,21 @@ def poses(recording: Recording) -> Optical:
 
 
 def align_run(recording: Recording) -> RunAlignment:
-    """Clock and frame of the tracker, and of an encoder of the attitude, against the IMU.
+    """Clock and rotation of the tracker, and of an encoder of the attitude, relative to the IMU.
 
-    Raises `RecordingError` where the tracker does not tell; of the encoder that is a note.
+    Raises
+    ------
+    RecordingError
+        If the tracker's alignment cannot be estimated. A failure of the encoder becomes a note.
     """
     imu, place = recording.need_imu(), recording.path or recording.name
     tracker = align(poses(recording), imu, place)
     notes = []
-    if drifts(tracker):
+    if has_drift(tracker):
         notes.append(
             f"the tracker's clock drifts against the IMU's by {1e6 * tracker.drift:.1f} ppm,"
-            f" {1e3 * tracker.drift * tracker.duration_s:.1f} ms over the run: without a"
-            " clock_drift an offset holds in its middle only"
+            f" {1e3 * tracker.drift * tracker.duration_s:.1f} ms over the run: without"
+            " clock_drift a constant offset is right in the middle of the run only"
         )
     encoder = None
     joint = "axis" in recording.info.get("encoder_about", {})
@@ -101,22 +110,28 @@ def align_run(recording: Recording) -> RunAlignment:
         try:
             encoder = align(Optical(stream.time_ns, stream.q_ref_body, stream.valid), imu, place)
         except RecordingError as error:
-            notes.append(f"the encoder does not tell: {error}")
+            notes.append(f"the encoder's alignment could not be estimated: {error}")
     return RunAlignment(recording.name, tracker, encoder, tuple(notes))
 
 
 def align(optical: Optical, imu: Imu, place: object = "recording") -> AttitudeMatch:
-    """Clock, drift and frame of one stream of attitudes. Raises `RecordingError`: see `match`, `refine`."""
+    """Clock, drift and rotation of one stream of attitudes.
+
+    Raises
+    ------
+    RecordingError
+        As `time_offset.match` and `attitude_alignment.refine`.
+    """
     return refine(optical, imu, match(optical, imu, place), place)
 
 
-def is_late(found: AttitudeMatch) -> bool:
-    """Whether a latency is there, for certain, that matters."""
+def has_latency(found: AttitudeMatch) -> bool:
+    """Whether a latency is significant and larger than 2 ms."""
     return abs(found.latency_s) > max(_LATE_S, _SIGMAS * found.latency_sigma_s)
 
 
-def turned_deg(found: AttitudeMatch) -> tuple[float, float] | None:
-    """By how many degrees the frames are turned, and the largest deviation; None where they may be one."""
+def misalignment_deg(found: AttitudeMatch) -> tuple[float, float] | None:
+    """Angle between the frames and its largest standard deviation, deg; None if it is not significant."""
     angle = float(np.linalg.norm(found.alignment))
     sigma = float(np.sqrt(np.linalg.eigvalsh(found.alignment_cov)[-1]))
     if angle <= max(_TURNED, _SIGMAS * sigma):
@@ -124,29 +139,29 @@ def turned_deg(found: AttitudeMatch) -> tuple[float, float] | None:
     return float(np.rad2deg(angle)), float(np.rad2deg(sigma))
 
 
-def drifts(found: AttitudeMatch) -> bool:
-    """Whether a drift is there that one offset cannot make good."""
+def has_drift(found: AttitudeMatch) -> bool:
+    """Whether a drift is significant and changes the latency by more than 1 ms over the run."""
     return (
         abs(found.drift) > _DRIFTS * found.drift_sigma
         and abs(found.drift) * found.duration_s > _MATTERS_S
     )
 
 
-def together(runs: Sequence[RunAlignment]) -> Together:
-    """One latency and one alignment of all runs, each run with the weight of its covariance."""
+def combine_runs(runs: Sequence[RunAlignment]) -> CombinedAlignment:
+    """One latency and one alignment for all runs, each run weighted by its inverse covariance."""
     found = [run.tracker for run in runs]
     latency = np.array([m.latency_s for m in found])[:, None]
     variance = np.array([[[m.latency_sigma_s**2]] for m in found])
     mean, cov, statistic, p = _mean(latency, variance)
     frames = Rotation.from_rotvec([m.alignment for m in found])
-    # The best known one is where the others are compared; errors are turns in the tracked frame.
+    # Rotations are compared relative to the most certain one; errors are rotations in the tool frame.
     best = int(np.argmin([np.trace(m.alignment_cov) for m in found]))
     off = (frames[best].inv() * frames).as_rotvec()
     turn, turn_cov, turn_chi2, turn_p = _mean(off, np.array([m.alignment_cov for m in found]))
     drift, drift_sigma = _mean_drift(found)
     grown = 0.0 if np.isnan(drift) else drift
     early = latency - grown * 0.5 * np.array([[m.duration_s] for m in found])
-    return Together(
+    return CombinedAlignment(
         len(found),
         float(mean[0]),
         float(np.sqrt(cov[0, 0])),
@@ -163,7 +178,7 @@ def together(runs: Sequence[RunAlignment]) -> Together:
 
 
 def _mean_drift(found: Sequence[AttitudeMatch]) -> tuple[float, float]:
-    """Mean by weight of the runs that are long enough, and its deviation, widened where they disagree."""
+    """Weighted mean drift of the runs that are long enough, and its standard deviation."""
     known = [m for m in found if np.isfinite(m.drift)]
     if not known:
         return np.nan, np.nan
@@ -173,7 +188,7 @@ def _mean_drift(found: Sequence[AttitudeMatch]) -> tuple[float, float]:
 
 
 def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
-    """Mean (n,) of vectors (N, n) by weight, its covariance, and chi-square about it with its p."""
+    """Weighted mean (n,) of vectors (N, n), its covariance, the chi-square about it and the p-value."""
     weight = np.linalg.inv(covs)
     cov = np.linalg.inv(weight.sum(axis=0))
     mean = cov @ np.einsum("nij,nj->i", weight, values)
@@ -186,20 +201,25 @@ def _mean(values: Floats, covs: Floats) -> tuple[Floats, Floats, float, float]:
     return mean, cov * max(1.0, statistic / freedom if p < _AGREE else 1.0), statistic, p
 
 
-def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[str, ...]]:
-    """The model's parameters with clock and frame set, and sentences on what could not be.
+def calibration_for(model: Model, found: CombinedAlignment) -> tuple[Parameters, tuple[str, ...]]:
+    """The model's parameters with clock and rotation set, and sentences on what could not be set.
 
-    A model's `latency` or `clock_offset` (its negative), `clock_drift` (what the IMU's clock gains on the
-    tracker's) where it has one and a drift is told, and `alignment` where it is known to half a degree
-    about every axis. `loose` turns the IMU's rates into the tracked frame, the models of a pose the tracked
-    frame into the IMU's. Raises `ModelError` for a model that has neither.
+    The function sets a model's `latency` or `clock_offset` (its negative), `clock_drift` (gain of the IMU's
+    clock over the tracker's) if the model has one and the drift is significant, and `alignment` if it is
+    known to half a degree about every axis. `loose` rotates the IMU's rates into the tool frame, the pose
+    models rotate the tool frame into the IMU's.
+
+    Raises
+    ------
+    ModelError
+        If the model has neither `latency` nor `clock_offset`.
     """
     calibration = model.parameters.calibration
     names = set(getattr(calibration, "_fields", ()))
     changes: dict[str, Any] = {}
     latency = found.latency_s
-    if "clock_drift" in names and found.drifts:
-        # It counts from the start of a run, at which the offset then holds.
+    if "clock_drift" in names and found.has_drift:
+        # The drift counts from the start of a run, so the offset is that of the start.
         latency = found.start_latency_s
         changes["clock_drift"] = np.array(-found.drift)
     if "clock_offset" in names:
@@ -217,7 +237,7 @@ def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[st
     if not worst <= _KNOWN:
         return _with(model, changes), (
             f"the alignment is known to {np.rad2deg(worst):.2g} deg only about one axis, expected"
-            f" {np.rad2deg(_KNOWN):.1g} deg or better: it is not set; record turns about several axes",
+            f" {np.rad2deg(_KNOWN):.1g} deg or better: it is not set; record rotation about several axes",
         )
     inward = "clock_offset" in names
     changes["alignment"] = -found.alignment if inward else found.alignment
@@ -227,3 +247,10 @@ def calibration_for(model: Model, found: Together) -> tuple[Parameters, tuple[st
 def _with(model: Model, changes: dict[str, Any]) -> Parameters:
     params = model.parameters
     return params._replace(calibration=params.calibration._replace(**changes))
+
+
+__getattr__ = renamed(
+    __name__,
+    "Together>CombinedAlignment drifts>has_drift is_late>has_latency together>combine_runs "
+    "turned_deg>misalignment_deg",
+)

@@ -1,8 +1,9 @@
-"""Overlapping Allan deviation of a sensor at rest, and what a static recording tells of its noise.
+"""Overlapping Allan deviation and noise densities of a sensor at rest.
 
-The square of the deviation at ``tau`` is half the mean square of ``mean over the next tau - mean over this
-tau``, over all places to begin. Its intervals are those of chi-square with the equivalent degrees of
-freedom of the kind of noise that prevails at ``tau`` (Riley, NIST SP 1065, table 5, overlapping estimator).
+The Allan variance at ``tau`` is half the mean square of ``mean over the next tau - mean over this tau``,
+over all starting points. Its confidence intervals are chi-square intervals with the equivalent degrees of
+freedom of the noise type that dominates at ``tau`` (Riley, NIST SP 1065, table 5, overlapping estimator).
+`imu_noise` analyses a static IMU; `noise_densities.fit` does the fit of one axis.
 """
 
 from typing import NamedTuple
@@ -15,17 +16,18 @@ from jaxekf.calibration.noise_densities import Densities, fit
 from jaxekf.recordings.types import NANOSECONDS, Floats, Imu, Times, period_ns
 
 _PER_OCTAVE = 3
+"""Averaging times per octave."""
 _LARGEST_SHARE = 0.1
-"""Of the length: the longest time that is averaged over."""
+"""Longest averaging time as a share of the recording's length."""
 _LONGEST_GAP = 20
-"""Samples in a row that may be missing; they are interpolated, further ones end a stretch."""
+"""Missing samples in a row that are interpolated; a longer gap ends the stretch."""
 _MISSING_SHARE = 0.02
 _LEAST_SAMPLES = 100
 _LEAST_S = 3.0
 
 
 class Curve(NamedTuple):
-    """Allan deviation over averaging time, of three axes, with 95 % intervals; in the samples' unit."""
+    """Allan deviation of three axes over averaging time, with 95 % intervals, in the samples' unit."""
 
     tau: Floats
     """(T,) seconds."""
@@ -38,7 +40,7 @@ class Curve(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """One sensor of three axes at rest."""
+    """Noise of one three-axis sensor at rest."""
 
     unit: str
     curve: Curve
@@ -50,16 +52,16 @@ class SensorNoise(NamedTuple):
         return np.array([axis.white.value for axis in self.axes])
 
     def floor(self) -> tuple[Floats, Floats]:
-        """The smallest deviation (3,), and the time (3,), s, it is reached at: how stable a bias can be."""
+        """Bias instability: smallest deviation (3,) and the averaging time (3,), s, at which it occurs."""
         lowest = self.curve.deviation.argmin(axis=0)
         return self.curve.deviation[lowest, range(3)], self.curve.tau[lowest]
 
 
 class ImuNoise(NamedTuple):
-    """An IMU at rest."""
+    """Noise of an IMU at rest."""
 
     duration_s: float
-    """Of the stretch that was used."""
+    """Length of the stretch that was used, s."""
     samples: int
     missing: int
     """Samples that were interpolated."""
@@ -68,10 +70,21 @@ class ImuNoise(NamedTuple):
 
 
 def imu_noise(imu: Imu, place: object = "recording") -> ImuNoise:
-    """Noise of gyroscope and accelerometer from an IMU that rests throughout.
+    """Noise of gyroscope and accelerometer from an IMU that is static throughout.
 
-    The longest stretch without a long gap is used. Raises `RecordingError` where that is under 3 s or 100
-    samples.
+    The longest stretch without a long gap is used.
+
+    Parameters
+    ----------
+    imu
+        Static samples.
+    place
+        Name of the recording for error messages.
+
+    Raises
+    ------
+    RecordingError
+        If that stretch is shorter than 3 s or 100 samples.
     """
     period_s, filled, missing = _regular(imu)
     count, duration_s = len(filled), len(filled) * period_s
@@ -80,7 +93,7 @@ def imu_noise(imu: Imu, place: object = "recording") -> ImuNoise:
             str(place),
             f"{duration_s:.1f} s ({count} samples) of an IMU at rest, without gaps",
             f"{_LEAST_S:.0f} s and {_LEAST_SAMPLES} samples or more",
-            "a recording that rests longer",
+            "a longer static recording",
         )
     gyroscope = sensor_noise(filled[:, :3], period_s, "rad/s")
     accelerometer = None
@@ -90,7 +103,17 @@ def imu_noise(imu: Imu, place: object = "recording") -> ImuNoise:
 
 
 def sensor_noise(values: Floats, period_s: float, unit: str) -> SensorNoise:
-    """Allan deviation and densities of a sensor's samples (n, 3), evenly spaced, at rest."""
+    """Allan deviation and noise densities of evenly spaced static samples.
+
+    Parameters
+    ----------
+    values
+        (n, 3) samples in `unit`.
+    period_s
+        Sampling period, s.
+    unit
+        Unit of the samples.
+    """
     x, y, z = (fit(values[:, i], period_s) for i in range(3))
     lengths = averaging_lengths(len(values))
     tau = lengths * period_s
@@ -106,13 +129,12 @@ def sensor_noise(values: Floats, period_s: float, unit: str) -> SensorNoise:
         ],
         axis=1,
     )
-    low = found * np.sqrt(freedom / chi_square.ppf(0.975, freedom))
-    high = found * np.sqrt(freedom / chi_square.ppf(0.025, freedom))
-    return SensorNoise(unit, Curve(tau, found, low, high), (x, y, z))
+    interval = chi_square.deviation_interval(found, freedom)
+    return SensorNoise(unit, Curve(tau, found, *interval), (x, y, z))
 
 
 def averaging_lengths(count: int) -> Floats:
-    """Whole numbers of samples to average over, three an octave, up to a tenth of `count`."""
+    """Averaging lengths in samples, three per octave, up to a tenth of `count`."""
     largest = max(1.0, _LARGEST_SHARE * count)
     octaves = np.arange(0.0, np.log2(largest) + 1e-9, 1.0 / _PER_OCTAVE)
     return np.unique(np.round(2.0**octaves)).astype(float)
@@ -131,8 +153,14 @@ def overlapping_deviation(values: Floats, lengths: Floats) -> Floats:
 def degrees_of_freedom(points: int, m: int, exponent: int) -> float:
     """Equivalent degrees of freedom of an overlapping Allan variance (Riley, NIST SP 1065, table 5).
 
-    `points` are those of the integral, one more than samples; `m` the averaging length; `exponent` of the
-    power of frequency that the noise's spectrum follows: 2, 0, -1 or -2.
+    Parameters
+    ----------
+    points
+        Number of points of the integral, one more than the samples.
+    m
+        Averaging length in samples.
+    exponent
+        Exponent of the noise's power spectrum in frequency: 2, 0, -1 or -2.
     """
     n = float(points)
     if exponent == 2:
@@ -152,7 +180,7 @@ def degrees_of_freedom(points: int, m: int, exponent: int) -> float:
 
 
 def _regular(imu: Imu) -> tuple[float, Floats, int]:
-    """Period, evenly spaced samples (n, 3 or 6) of the longest stretch, and how many are interpolated."""
+    """Sampling period, even samples (n, 3 or 6) of the longest stretch, and the number interpolated."""
     values = imu.gyroscope
     if imu.accelerometer is not None:
         values = np.concatenate([values, imu.accelerometer], axis=1)
@@ -160,7 +188,7 @@ def _regular(imu: Imu) -> tuple[float, Floats, int]:
     steps = np.round(np.diff(imu.time_ns) / nominal).astype(int)
     begin, end = _longest(steps)
     steps, values, times = steps[begin : end - 1], values[begin:end], imu.time_ns[begin:end]
-    # Stamps jitter; the sensor's own clock does not.
+    # Time stamps jitter, the sensor's own clock does not.
     number = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
     if len(number) < 2:
         return nominal / NANOSECONDS, values, 0

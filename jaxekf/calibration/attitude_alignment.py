@@ -1,27 +1,27 @@
-"""Clock, its drift, and frame of a tracker against an IMU, from the attitudes themselves.
+"""Clock offset, clock drift and rotation between a tracker and an IMU, from the attitudes themselves.
 
-`synchronise.match` compares turns from sample to sample, which finds clock and frame from nothing but loses
-what the sum of many turns tells. Here the tracker's attitude is compared with the integral of the gyroscope
-over two seconds at a time, each with a constant rotation of its own,
+`time_offset.match` compares rotations from sample to sample. It needs no initial values but does not use
+that many rotations add up to one attitude. `refine` starts from its result and compares the tracker's
+attitude with the integral of the gyroscope over stretches of two seconds, each with a constant rotation of
+its own,
 
     q_k  =  A_c  G(t_k - L - D (t_k - m))  F  exp(noise),
 
-Gauss and Newton on latency ``L``, drift ``D``, frame ``F`` and the bias within ``G``. In the reference
-frame ``A_c`` leaves with the mean of each stretch. Residuals may be correlated within a stretch, as those
-of a filtering tracker or a noisy gyroscope are: deviations are those of clusters.
+by Gauss-Newton on latency ``L``, drift ``D``, rotation ``F`` and the bias within ``G``. In the reference
+frame ``A_c`` is removed with the mean of each stretch. Residuals may be correlated within a stretch, as
+with a tracker that filters or a noisy gyroscope: the covariance is cluster-robust, one cluster a stretch.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.time_offset import Match
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, to_scipy
-
-Whole = NDArray[np.intp]
+from jaxekf.geometry.host_rotation import running_product
+from jaxekf.recordings.accounts import Indices
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, from_scipy, to_scipy
 
 _STRETCH_S = 2.0
 _FEWEST_STRETCHES = 20
@@ -31,97 +31,114 @@ _LONGEST_IMU_GAP_S = 0.1
 _SPARE_S = 0.1
 _LEAST_STRETCHES = 10
 _ROUNDS = 12
-_OUTLYING = 5.0
-_SETTLED = 0.01
-"""Deviations within which a step ends the search."""
+_OUTLIER_RATIO = 5.0
+_CONVERGED = 0.01
+"""A step smaller than this many standard deviations ends the iterations."""
 _LEAST_DRIFT_S = 20.0
 _EXPLAINED, _KEPT = 0.8, 0.8
 _LARGEST_DRIFT = 1e-3
 _PRIOR = np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2, 0.1, 1e-3])
-"""Deviations of alignment (rad), bias (rad/s), latency (s) and drift that are believed beforehand: so wide
-that they count only where nothing else tells."""
+"""Prior standard deviations of alignment (rad), bias (rad/s), latency (s) and drift, wide enough to matter
+only for unobservable parameters."""
 
 
 class AttitudeMatch(NamedTuple):
-    """How a tracker lies to an IMU in time and frame; see `synchronise.Match`."""
+    """Time offset, drift and rotation of a tracker relative to an IMU; see `time_offset.Match`."""
 
     latency_s: float
-    """In the middle of the run."""
+    """Latency in the middle of the run, s."""
     latency_sigma_s: float
     drift: float
-    """Seconds by which the latency grows in a second; NaN where the run is too short to tell."""
+    """Growth of the latency, s/s; NaN if the run is too short to estimate it."""
     drift_sigma: float
     alignment: Floats
-    """(3,) rotation vector, rad, that takes vectors of the tracked frame into the IMU's."""
+    """(3,) rotation vector, rad, tool frame to IMU frame."""
     alignment_cov: Floats
-    """(3, 3) rad^2, of a small turn in the tracked frame, applied before the alignment."""
+    """(3, 3) rad^2, of a small rotation in the tool frame, applied before the alignment."""
     bias: Floats
-    """(3,) rad/s, of the gyroscope."""
+    """(3,) rad/s, gyroscope bias."""
     scatter: float
-    """Root mean square of the residuals of an axis, rad."""
+    """Root mean square of the residuals of one axis, rad."""
     middle_s: float
     """Seconds from the IMU's first sample to the middle of the run."""
     duration_s: float
 
 
-class _Seen(NamedTuple):
-    """Attitudes that can be compared, stretch after stretch."""
+class _Stretches(NamedTuple):
+    """Attitudes that are compared, in stretches."""
 
     t: Floats
     """(N,) seconds since the IMU's first sample, as stamped."""
     q: Rotation
-    """N of them, tracked frame to reference."""
-    begin: Whole
-    """(C,) row that each stretch begins with."""
+    """N attitudes, tool to reference."""
+    begin: Indices
+    """(C,) first row of each stretch."""
 
-    def spread(self, values: Floats) -> Floats:
-        """What is said of stretches (C, ...), of their rows."""
+    def to_rows(self, values: Floats) -> Floats:
+        """Values of stretches (C, ...), repeated for their rows (N, ...)."""
         return np.repeat(values, np.diff(self.begin, append=len(self.t)), axis=0)
 
-    def less_mean(self, values: Floats, kept: Flags) -> Floats:
-        """Values (N, ...) less the mean over the rows of their stretch that are kept."""
+    def remove_mean(self, values: Floats, kept: Flags) -> Floats:
+        """Values (N, ...) minus the mean over the kept rows of their stretch."""
         count = np.maximum(np.add.reduceat(kept.astype(float), self.begin), 1.0)
         weight = kept.reshape(-1, *[1] * (values.ndim - 1))
         total = np.add.reduceat(values * weight, self.begin, axis=0)
-        return values - self.spread(total / count.reshape(-1, *[1] * (values.ndim - 1)))
+        return values - self.to_rows(total / count.reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording") -> AttitudeMatch:
-    """Latency, drift, alignment and bias of a stream of attitudes, from what `match` found.
+    """Latency, drift, alignment and bias of a stream of attitudes, from the result of `time_offset.match`.
 
-    Raises `RecordingError` where the gyroscope does not explain how the attitude turns.
+    Parameters
+    ----------
+    optical
+        Attitudes of the tool.
+    imu
+        Rates of the IMU.
+    start
+        Result of `time_offset.match`.
+    place
+        Name of the recording for error messages.
+
+    Raises
+    ------
+    RecordingError
+        If the gyroscope does not explain the rotation of the tracker, if too few stretches remain, or if
+        the clocks drift by more than 1000 ppm.
     """
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
-    seen = _seen(optical, imu, start.latency_s, place)
-    middle = 0.5 * float(seen.t[0] + seen.t[-1])
-    duration = float(seen.t[-1] - seen.t[0])
+    stretches = _stretches(optical, imu, start.latency_s, place)
+    middle = 0.5 * float(stretches.t[0] + stretches.t[-1])
+    duration = float(stretches.t[-1] - stretches.t[0])
     free = slice(0, 8 if duration >= _LEAST_DRIFT_S else 7)
     frame, bias = Rotation.from_rotvec(start.alignment), start.bias
     clock = np.array([start.latency_s, 0.0])
-    kept, elapsed = np.ones(len(seen.t), bool), seen.t - middle
-    made = _Solved(np.zeros(8), np.eye(8), np.zeros((len(seen.t), 3)), 0.0)
+    kept, elapsed = np.ones(len(stretches.t), bool), stretches.t - middle
+    solution = _Solution(np.zeros(8), np.eye(8), np.zeros((len(stretches.t), 3)), 0.0)
     for _ in range(_ROUNDS):
-        at = seen.t - clock[0] - clock[1] * elapsed
-        columns, off = _linear(seen, _integral(known, imu.gyroscope - bias, at), frame, kept)
+        at = stretches.t - clock[0] - clock[1] * elapsed
+        columns, off = _linearise(
+            stretches, _integrate(known, imu.gyroscope - bias, at), frame, kept
+        )
         columns = np.concatenate([columns, columns[:, :, 6:] * elapsed[:, None, None]], axis=2)
-        columns = seen.less_mean(columns[:, :, free], kept)
-        made = _solve(seen, columns, off, kept)
-        frame = frame * Rotation.from_rotvec(made.step[:3])
-        bias = bias + made.step[3:6]
-        clock = clock + np.clip(made.step[6:], -0.05, 0.05)
-        size = np.linalg.norm(made.residual, axis=1)
-        kept = size <= _OUTLYING * max(float(np.median(size)), 1e-12)
-        if np.all(np.abs(made.step) < _SETTLED * np.sqrt(np.diagonal(made.cov))):
+        columns = stretches.remove_mean(columns[:, :, free], kept)
+        solution = _solve(stretches, columns, off, kept)
+        frame = frame * Rotation.from_rotvec(solution.step[:3])
+        bias = bias + solution.step[3:6]
+        clock = clock + np.clip(solution.step[6:], -0.05, 0.05)
+        size = np.linalg.norm(solution.residual, axis=1)
+        kept = size <= _OUTLIER_RATIO * max(float(np.median(size)), 1e-12)
+        if np.all(np.abs(solution.step) < _CONVERGED * np.sqrt(np.diagonal(solution.cov))):
             break
-    _need_likeness(seen, made.residual, kept, place)
+    _require_agreement(stretches, solution.residual, kept, place)
     if abs(clock[1]) > _LARGEST_DRIFT:
         raise RecordingError(
             str(place),
-            f"a tracker's clock that gains {1e6 * clock[1]:.0f} ppm on the IMU's",
+            f"a clock drift of {1e6 * clock[1]:.0f} ppm between tracker and IMU",
             f"{1e6 * _LARGEST_DRIFT:.0f} ppm at most",
-            "streams that belong together, with clocks that do not jump",
+            "streams of one body, with clocks that do not jump",
         )
-    sigma = np.sqrt(np.diagonal(made.cov))
+    sigma = np.sqrt(np.diagonal(solution.cov))
     drifting = duration >= _LEAST_DRIFT_S
     return AttitudeMatch(
         float(clock[0]),
@@ -129,23 +146,23 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
         float(clock[1]) if drifting else np.nan,
         float(sigma[7]) if drifting else np.nan,
         frame.as_rotvec(),
-        made.cov[:3, :3],
+        solution.cov[:3, :3],
         bias,
-        made.scatter,
+        solution.scatter,
         middle,
         duration,
     )
 
 
-def _seen(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Seen:
-    """Valid attitudes within the IMU's time, in stretches in which the IMU has no gap."""
+def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Stretches:
+    """Valid attitudes within the IMU's time, in stretches without a gap of the IMU."""
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     inside = (t - latency_s >= known[0] + _SPARE_S) & (t - latency_s <= known[-1] - _SPARE_S)
     rows = np.flatnonzero(optical.valid & inside)
     span = float(np.ptp(t[rows])) if rows.size else 0.0
     length = float(np.clip(span / _FEWEST_STRETCHES, _SHORTEST_S, _STRETCH_S))
-    # A gap of the IMU ends a stretch, too.
+    # A gap of the IMU ends a stretch.
     gaps = known[1:][np.diff(known) > _LONGEST_IMU_GAP_S]
     label = np.floor(t[rows] / length) + np.searchsorted(gaps, t[rows] - latency_s)
     _, number, count = np.unique(label, return_inverse=True, return_counts=True)
@@ -156,103 +173,72 @@ def _seen(optical: Optical, imu: Imu, latency_s: float, place: object) -> _Seen:
             str(place),
             f"{rows.size} attitudes in {span:.1f} s within the IMU's time",
             f"{_LEAST_STRETCHES} stretches of {length:g} s or more to match the clocks by",
-            "a longer recording, or one in which the tool is seen",
+            "a longer recording, or one in which the tool is visible",
         )
     begin = np.flatnonzero(np.diff(number, prepend=-1))
-    return _Seen(t[rows], to_scipy(optical.q_ref_body[rows]), begin)
+    return _Stretches(t[rows], to_scipy(optical.q_ref_body[rows]), begin)
 
 
-class _Turned(NamedTuple):
-    """The gyroscope's integral at some times."""
+class _GyroscopeIntegral(NamedTuple):
+    """Integral of the gyroscope's rate at some times."""
 
     q: Rotation
-    """From the IMU's frame to one that is fixed, whatever it is."""
+    """IMU frame to a fixed frame that may be any."""
     rate: Floats
     """(N, 3) rad/s."""
-    swept: Floats
-    """(N, 3, 3) s: the integral of `q` as a matrix: what a bias does."""
+    q_integral: Floats
+    """(N, 3, 3) s: integral over time of `q` as a matrix, the derivative by a bias."""
 
 
-def _integral(known: Floats, rate: Floats, at: Floats) -> _Turned:
-    """Rates that are linear between samples, each step turned by their mean."""
+def _integrate(known: Floats, rate: Floats, at: Floats) -> _GyroscopeIntegral:
+    """Integrate rates that are linear between samples; each step rotates by their mean."""
     step = np.diff(known)
-    turn = _running(Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None]))
+    steps = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None])
+    turn = to_scipy(running_product(from_scipy(steps)))
     matrix = turn.as_matrix()
     slabs = 0.5 * (matrix[1:] + matrix[:-1]) * step[:, None, None]
-    swept = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
+    q_integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
     low: Any = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(step) - 1)
     since = (at - known[low])[:, None]
     slope = (rate[low + 1] - rate[low]) / step[low, None]
     q = turn[low] * Rotation.from_rotvec((rate[low] + 0.5 * slope * since) * since)
     half = 0.5 * (matrix[low] + q.as_matrix()) * since[:, :, None]
-    return _Turned(q, rate[low] + slope * since, swept[low] + half)
+    return _GyroscopeIntegral(q, rate[low] + slope * since, q_integral[low] + half)
 
 
-def _running(turn: Rotation) -> Rotation:
-    """The identity, and the products of the first one, two, ... of N rotations: N + 1 of them.
+def _linearise(
+    stretches: _Stretches, integral: _GyroscopeIntegral, frame: Rotation, kept: Flags
+) -> tuple[Floats, Floats]:
+    """Derivatives (N, 3, 7) of the residuals by alignment, bias and latency, and the residuals (N, 3), rad.
 
-    Blocks side by side first, then each after those before it: two products for each rotation.
+    Both are in the reference frame; the mean of each stretch is removed from the residuals.
     """
-    count = len(turn)
-    width = max(1, int(np.sqrt(count)))
-    blocks = -(-count // width)
-    # Components first, each contiguous: SciPy's product takes far longer to begin than to multiply.
-    q = np.zeros((4, blocks * width))
-    q[3] = 1.0
-    q[:, :count] = turn.as_quat().T
-    q = np.ascontiguousarray(q.reshape(4, blocks, width).transpose(2, 0, 1))
-    for i in range(1, width):
-        q[i] = _product(q[i - 1], q[i])
-    start = np.zeros((4, blocks))
-    start[3] = 1.0
-    for i in range(1, blocks):
-        start[:, i] = _product(start[:, i - 1], q[-1, :, i - 1])
-    whole = np.stack([_product(start, each) for each in q])
-    flat = whole.transpose(2, 0, 1).reshape(-1, 4)[:count]
-    return Rotation.from_quat(np.concatenate([[[0.0, 0.0, 0.0, 1.0]], flat]))
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Products of quaternions (4, ...), x, y, z, w."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return np.array(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    )
-
-
-def _linear(seen: _Seen, turned: _Turned, frame: Rotation, kept: Flags) -> tuple[Floats, Floats]:
-    """How the residuals, in the reference frame, change with alignment, bias and latency (N, 3, 7), and the
-    residuals (N, 3); of each stretch but for a constant."""
-    body = turned.q * frame
-    constant = _constant(seen, seen.q * body.inv(), kept)
+    body = integral.q * frame
+    constant = _mean_rotation(stretches, stretches.q * body.inv(), kept)
     expected = constant * body
-    off = expected.apply((seen.q.inv() * expected).as_rotvec())
-    of_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), turned.swept)
-    of_latency = -(constant * turned.q).apply(turned.rate)
-    columns = np.concatenate([expected.as_matrix(), of_bias, of_latency[:, :, None]], axis=2)
-    return columns, seen.less_mean(off, kept)
+    off = expected.apply((stretches.q.inv() * expected).as_rotvec())
+    d_bias = -np.einsum("nij,njk->nik", constant.as_matrix(), integral.q_integral)
+    d_latency = -(constant * integral.q).apply(integral.rate)
+    columns = np.concatenate([expected.as_matrix(), d_bias, d_latency[:, :, None]], axis=2)
+    return columns, stretches.remove_mean(off, kept)
 
 
-def _constant(seen: _Seen, each: Rotation, kept: Flags) -> Rotation:
-    """The mean over each stretch of rotations that are nearly one, for every row."""
+def _mean_rotation(stretches: _Stretches, each: Rotation, kept: Flags) -> Rotation:
+    """Mean of nearly equal rotations over the kept rows of each stretch, repeated for every row."""
     q = each.as_quat()
-    first = seen.spread(q[seen.begin])
+    first = stretches.to_rows(q[stretches.begin])
     q = q * np.where(np.sum(q * first, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    total = np.add.reduceat(q * kept[:, None], seen.begin, axis=0)
+    total = np.add.reduceat(q * kept[:, None], stretches.begin, axis=0)
     lost = np.linalg.norm(total, axis=1) < 1e-6
-    total[lost] = q[seen.begin][lost]
-    return Rotation.from_quat(seen.spread(total))
+    total[lost] = q[stretches.begin][lost]
+    return Rotation.from_quat(stretches.to_rows(total))
 
 
-class _Solved(NamedTuple):
+class _Solution(NamedTuple):
+    """Step of Gauss-Newton with its covariance."""
+
     step: Floats
-    """(8,); a drift that is not free is 0."""
+    """(8,); zero for a drift that is not estimated."""
     cov: Floats
     """(8, 8)."""
     residual: Floats
@@ -260,53 +246,55 @@ class _Solved(NamedTuple):
     scatter: float
 
 
-def _solve(seen: _Seen, columns: Floats, off: Floats, kept: Flags) -> _Solved:
-    """Least squares with what is believed beforehand, and its covariance by clusters, a stretch each."""
+def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> _Solution:
+    """Least squares with the prior, and its cluster-robust covariance, one cluster a stretch."""
     width = columns.shape[2]
     prior = 1.0 / np.square(_PRIOR[:width])
     used = columns * kept[:, None, None]
-    count = 3.0 * (kept.sum() - len(seen.begin)) - width
+    count = 3.0 * (kept.sum() - len(stretches.begin)) - width
     square, rhs = np.einsum("nij,nik->jk", used, columns), np.einsum("nij,ni->j", used, off)
 
     def solved(about: Floats) -> tuple[float, Floats, Floats]:
-        """By the variance of some residuals."""
+        """Variance of the residuals, inverse information and step."""
         variance = max(float(np.sum(np.square(about[kept]))) / max(count, 1.0), 1e-20)
         inverse = np.linalg.inv(square / variance + np.diag(prior))
         return variance, inverse, -inverse @ rhs / variance
 
-    # The first residuals are those of a start, which may be far off.
+    # The initial values may be far off, so the variance is that after a first step.
     residual = off + columns @ solved(off)[2]
     variance, inverse, step = solved(residual)
     residual = off + columns @ step
     score = np.einsum("nij,ni->nj", used, residual) / variance
-    score = np.add.reduceat(score, seen.begin, axis=0)
-    clusters = len(seen.begin)
+    score = np.add.reduceat(score, stretches.begin, axis=0)
+    clusters = len(stretches.begin)
     middle = score.T @ score * clusters / max(clusters - width, 1) + np.diag(prior)
     cov = np.diag(np.square(_PRIOR))
     cov[:width, :width] = inverse @ middle @ inverse
     whole = np.zeros(8)
     whole[:width] = step
-    return _Solved(whole, cov, residual, float(np.sqrt(variance)))
+    return _Solution(whole, cov, residual, float(np.sqrt(variance)))
 
 
-def _need_likeness(seen: _Seen, residual: Floats, kept: Flags, place: object) -> None:
-    """The gyroscope explains most of how the attitude turns within a stretch, and in most stretches, or it
-    is of another body, or of another clock half of the time."""
-    mean = _constant(seen, seen.q, kept)
-    turned = np.sum(np.square((mean.inv() * seen.q).as_rotvec()[kept]))
+def _require_agreement(stretches: _Stretches, residual: Floats, kept: Flags, place: object) -> None:
+    """Raise `RecordingError` unless the gyroscope explains most of the rotation in most stretches.
+
+    Otherwise the streams are from different bodies, or a clock jumps.
+    """
+    mean = _mean_rotation(stretches, stretches.q, kept)
+    rotated = np.sum(np.square((mean.inv() * stretches.q).as_rotvec()[kept]))
     left = np.sum(np.square(residual[kept]))
     if np.mean(kept) < _KEPT:
         raise RecordingError(
             str(place),
-            f"a gyroscope that turns as {100.0 * np.mean(kept):.0f} % of the tracker's samples do",
+            f"a gyroscope that agrees with {100.0 * np.mean(kept):.0f} % of the tracker's samples",
             f"{100.0 * _KEPT:.0f} % or more",
-            "streams that belong together, with clocks that do not jump",
+            "streams of one body, with clocks that do not jump",
         )
-    if left > (1.0 - _EXPLAINED) * turned:
+    if left > (1.0 - _EXPLAINED) * rotated:
         raise RecordingError(
             str(place),
-            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / turned):.0f} % of how the tracker"
-            " turns",
-            f"{100.0 * _EXPLAINED:.0f} % or more of one body's",
-            "streams that belong together, with clocks that do not jump",
+            f"a gyroscope that explains {100.0 * max(0.0, 1.0 - left / rotated):.0f} % of the tracker's"
+            " rotation",
+            f"{100.0 * _EXPLAINED:.0f} % or more",
+            "streams of one body, with clocks that do not jump",
         )

@@ -1,14 +1,15 @@
 """Noise densities of a sensor at rest, by maximum likelihood on the spectrum of its differences.
 
-A sample is a constant, and quantisation, white noise, flicker and a random walk. The sine transform of
-the differences from sample to sample makes those of white noise and walk independent, exactly; with
-``l = 2 - 2 cos(pi j / n)``, ``j = 1 ... n - 1``, and a sampling period ``t`` line ``j`` has the variance
+The model of a sample is a constant plus quantisation, white noise, flicker noise and a random walk. The
+sine transform of the differences from sample to sample makes those of white noise and walk exactly
+independent; with ``l = 2 - 2 cos(pi j / n)``, ``j = 1 ... n - 1``, and a sampling period ``t``, line ``j``
+has the variance
 
     Q^2 l^2 / t^2  +  N^2 l / t  +  B^2 sqrt(l)  +  K^2 t
 
-of which the first and third term hold approximately. The Allan deviations of the four are
-``sqrt(3) Q / tau``, ``N / sqrt(tau)``, ``sqrt(2 ln 2 / pi) B`` and ``K sqrt(tau / 3)`` (IEEE Std 952).
-Intervals are those of the profile likelihood, which needs no normal distribution and tells zero from small.
+The first and the third term are approximations. The Allan deviations of the four are ``sqrt(3) Q / tau``,
+``N / sqrt(tau)``, ``sqrt(2 ln 2 / pi) B`` and ``K sqrt(tau / 3)`` (IEEE Std 952). Confidence intervals are
+those of the profile likelihood, which needs no normal distribution and distinguishes zero from small.
 """
 
 from collections.abc import Callable
@@ -19,58 +20,59 @@ from scipy.fft import dst
 from scipy.optimize import brentq, nnls
 
 from jaxekf._support import chi_square
+from jaxekf._support.deprecations import renamed
 from jaxekf.recordings.types import Flags, Floats
 
 TERMS = ("quantisation", "white", "flicker", "walk")
 _ALL = _QUANTISATION, _WHITE, _FLICKER, _WALK = (0, 1, 2, 3)
 _INTERVAL = float(chi_square.ppf(0.95, 1))
 _SIGNIFICANT = float(chi_square.ppf(0.99, 1))
-"""By how much twice the logarithm of the likelihood must grow for a third term to be believed."""
+"""Increase of twice the log-likelihood from which a further term is significant."""
 _LINES_PER_E = 25.0
 _ROUNDS = 60
 _MISFIT, _MISFIT_SIGMAS = 0.1, 4.0
-"""Third-octaves off by more than both say that the noise is of another kind up there."""
+"""Third-octaves off by more than both: the noise is of another type at those frequencies."""
 _PEAK, _PEAK_SIGMAS, _PEAK_ROUNDS = 0.5, 6.0, 4
-"""Lines larger by more than both are of a vibration."""
+"""Lines larger than the model by more than both belong to a vibration."""
 _OCTAVES_JUDGED, _OCTAVES_DROPPED = 7, 6
 _LEAST_LINES = 100
 
 
-class Estimated(NamedTuple):
-    """A coefficient with its 95 % interval; `low` is 0 where the data do not tell it from nothing."""
+class Coefficient(NamedTuple):
+    """A coefficient with its 95 % interval; `low` is 0 if it is not significant."""
 
     value: float
     low: float
     high: float
 
     @property
-    def found(self) -> bool:
-        """Whether it is told from nothing."""
+    def significant(self) -> bool:
+        """Whether the coefficient differs significantly from zero."""
         return self.low > 0.0
 
 
 class Densities(NamedTuple):
-    """What one axis is made of, in the unit ``u`` of its samples."""
+    """Noise of one axis, in the unit ``u`` of its samples."""
 
     quantisation: float
     """Q, u s."""
-    white: Estimated
+    white: Coefficient
     """N, u/sqrt(Hz)."""
     flicker: float
-    """B, u; 0 where nothing speaks for it."""
-    walk: Estimated
+    """B, u; 0 if it is not significant."""
+    walk: Coefficient
     """K, u/s/sqrt(Hz)."""
-    walk_alone: Estimated
-    """K, u/s/sqrt(Hz), where a walk has to stand for flicker too, as in a filter that knows no flicker."""
+    walk_alone: Coefficient
+    """K, u/s/sqrt(Hz), fitted without flicker noise, for a filter whose model has none."""
     band_hz: float
-    """Up to this frequency the noise is of this kind, and was used."""
+    """Highest frequency, Hz, that was used; above it the noise is of another type."""
 
     def deviation(self, tau: Floats) -> Floats:
         """Allan deviation (T,) at `tau` (T,), s."""
         return np.sqrt(self._parts(tau).sum(axis=0))
 
     def exponent(self, tau: Floats) -> Floats:
-        """Of the power law in frequency that most of the deviation is due to: 2, 0, -1 or -2, (T,)."""
+        """Exponent in frequency of the noise type that dominates at `tau`: 2, 0, -1 or -2, (T,)."""
         return np.array([2, 0, -1, -2])[self._parts(tau).argmax(axis=0)]
 
     def _parts(self, tau: Floats) -> Floats:
@@ -85,10 +87,10 @@ class Densities(NamedTuple):
 
 
 class _Lines(NamedTuple):
-    """Lines of a spectrum, neighbours together."""
+    """Lines of a spectrum, neighbours averaged."""
 
     held: Floats
-    """(L,)."""
+    """(L,) lines that were averaged."""
     power: Floats
     """(L,) mean square."""
     shape: Floats
@@ -96,28 +98,35 @@ class _Lines(NamedTuple):
     hertz: Floats
     """(L,)."""
 
-    def where(self, chosen: Flags) -> "_Lines":
+    def select(self, chosen: Flags) -> "_Lines":
         """Some of them."""
         return _Lines(*(field[chosen] for field in self))
 
 
 def fit(values: Floats, period_s: float) -> Densities:
-    """Coefficients of one axis from its samples (n,), evenly spaced.
+    """Noise coefficients of one axis.
 
-    Where the spectrum is not of the four kinds at its upper end (a low pass in the sensor), octaves are
-    left out there, as a filter cares for what remains over many samples; single peaks (a vibration) are
-    left out anywhere. `values` that never change give zeros.
+    If the spectrum's upper end does not fit the four terms (a low pass in the sensor), octaves are left out
+    there, since a filter depends on the noise over many samples. Single peaks (a vibration) are left out
+    everywhere. Values that never change give zeros.
+
+    Parameters
+    ----------
+    values
+        (n,) evenly spaced static samples.
+    period_s
+        Sampling period, s.
     """
     step = np.diff(np.asarray(values, float))
     if not step.any():
-        nothing = Estimated(0.0, 0.0, 0.0)
+        nothing = Coefficient(0.0, 0.0, 0.0)
         return Densities(0.0, nothing, 0.0, nothing, nothing, 0.5 / period_s)
-    lines = _of_the_four_kinds(_lines(step, period_s))
+    lines = _fitting_lines(_lines(step, period_s))
     terms, found = (_WHITE, _WALK), _maximise(lines, (_WHITE, _WALK))
     spread = _spread(lines, _maximise(lines, _ALL))
-    terms, found = _with(lines, terms, found, _QUANTISATION, spread)
+    terms, found = _with_term(lines, terms, found, _QUANTISATION, spread)
     alone = _interval(lines, terms, found, _WALK, spread)
-    terms, found = _with(lines, terms, found, _FLICKER, spread)
+    terms, found = _with_term(lines, terms, found, _FLICKER, spread)
     return Densities(
         float(np.sqrt(found[_QUANTISATION])),
         _interval(lines, terms, found, _WHITE, spread),
@@ -128,18 +137,18 @@ def fit(values: Floats, period_s: float) -> Densities:
     )
 
 
-def _with(
+def _with_term(
     lines: _Lines, terms: tuple[int, ...], found: Floats, term: int, spread: float
 ) -> tuple[tuple[int, ...], Floats]:
-    """One term more, where the likelihood speaks for it."""
+    """Add a term if the likelihood ratio is significant."""
     richer = _maximise(lines, (*terms, term))
     if _cost(lines, found) - _cost(lines, richer) > spread * _SIGNIFICANT:
         return (*terms, term), richer
     return terms, found
 
 
-def _of_the_four_kinds(lines: _Lines) -> _Lines:
-    """The part of a spectrum that is, from low frequencies up, without single peaks in it."""
+def _fitting_lines(lines: _Lines) -> _Lines:
+    """The lines that fit the four terms, from low frequencies up, without single peaks."""
     best, least = lines, np.inf
     for _ in range(_OCTAVES_DROPPED):
         kept = lines
@@ -148,19 +157,19 @@ def _of_the_four_kinds(lines: _Lines) -> _Lines:
             low = ratio <= 1.0 + np.maximum(_PEAK, _PEAK_SIGMAS * np.sqrt(2.0 / kept.held))
             if low.all():
                 break
-            kept = kept.where(low)
+            kept = kept.select(low)
         misfit = _misfit(kept, kept.shape @ _maximise(kept, _ALL))
         if misfit < least:
             best, least = kept, misfit
         lower = lines.hertz <= 0.5 * lines.hertz[-1]
         if misfit == 0.0 or lines.held[lower].sum() < _LEAST_LINES:
             break
-        lines = lines.where(lower)
+        lines = lines.select(lower)
     return best
 
 
 def _lines(step: Floats, period_s: float) -> _Lines:
-    """The spectrum of differences, in bins that are narrow beside any change of the terms."""
+    """Spectrum of differences, in bins that are narrow relative to any change of the terms."""
     count = len(step)
     power = np.asarray(dst(step, type=1, norm="ortho")) ** 2
     number = np.arange(1, count + 1)
@@ -181,7 +190,7 @@ def _lines(step: Floats, period_s: float) -> _Lines:
 
 
 def _cost(lines: _Lines, coefficients: Floats) -> float:
-    """Minus twice the logarithm of the likelihood."""
+    """Minus twice the log-likelihood."""
     variance = lines.shape @ coefficients
     if not np.all(variance > 0.0):
         return np.inf
@@ -194,8 +203,11 @@ def _maximise(
     held: tuple[int, float] | None = None,
     start: Floats | None = None,
 ) -> Floats:
-    """Coefficients (4,), squared, of the largest likelihood, none negative: Fisher's scoring, each step a
-    non-negative least-squares problem. `held` is one of them and its value."""
+    """Squared coefficients (4,) of the largest likelihood, none negative.
+
+    Fisher scoring, each step a non-negative least-squares problem. `held` fixes one coefficient: its index
+    and its value.
+    """
     free = [term for term in terms if held is None or term != held[0]]
     fixed = np.zeros(4)
     if held is not None:
@@ -227,8 +239,8 @@ def _maximise(
 
 def _interval(
     lines: _Lines, terms: tuple[int, ...], found: Floats, term: int, spread: float
-) -> Estimated:
-    """The coefficients that the likelihood does not refuse, all others at their best."""
+) -> Coefficient:
+    """Confidence interval by the profile likelihood: the other coefficients are at their best."""
     best = _cost(lines, found)
 
     def excess(value: float) -> float:
@@ -240,11 +252,11 @@ def _interval(
     low = 0.0
     if found[term] > 0.0 and excess(0.0) > 0.0:
         low = _crossing(excess, float(found[term]), 0.5)
-    return Estimated(*(float(np.sqrt(value)) for value in (found[term], low, high)))
+    return Coefficient(*(float(np.sqrt(value)) for value in (found[term], low, high)))
 
 
 def _crossing(excess: Callable[[float], float], begin: float, factor: float) -> float:
-    """Where an interval ends, going from within it."""
+    """End of a confidence interval, searched outwards from a point within it."""
     inner = begin
     for _ in range(80):
         outer = inner * factor
@@ -257,13 +269,13 @@ def _crossing(excess: Callable[[float], float], begin: float, factor: float) -> 
 
 
 def _spread(lines: _Lines, found: Floats) -> float:
-    """By how much the lines scatter more than they should, at least 1: intervals grow with it."""
+    """Factor, at least 1, by which the lines scatter more than the model; it widens the intervals."""
     ratio = lines.power / (lines.shape @ found)
     return max(1.0, float(np.mean(0.5 * lines.held * np.square(ratio - 1.0))))
 
 
 def _misfit(lines: _Lines, variance: Floats) -> float:
-    """By how much third-octaves of the upper part are off, on average; 0 where none says so for sure."""
+    """Mean relative error of the third-octaves of the upper part; 0 if none is significant."""
     near = lines.hertz >= lines.hertz[-1] / 2.0**_OCTAVES_JUDGED
     label = np.floor(3.0 * np.log2(lines.hertz[-1] / lines.hertz[near])).astype(int)
     held = np.bincount(label, lines.held[near])
@@ -273,3 +285,6 @@ def _misfit(lines: _Lines, variance: Floats) -> float:
     if np.all(off <= np.maximum(_MISFIT, _MISFIT_SIGMAS * np.sqrt(2.0 / held))):
         return 0.0
     return float(off.mean())
+
+
+__getattr__ = renamed(__name__, "Estimated>Coefficient")

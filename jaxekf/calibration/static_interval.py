@@ -1,4 +1,7 @@
-"""How long a run rests at its start, and how much a tracker scatters meanwhile."""
+"""Static interval at the start of a run, and the tracker's noise during it.
+
+`static_head` returns the length of the interval, `tracker_noise` the standard deviations of the tracker.
+"""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -22,16 +25,16 @@ from jaxekf.recordings.types import (
 
 _WINDOW_S = 0.5
 _REMEMBERED = 120
-"""Windows whose mean is the constant that the next one must keep."""
+"""Windows whose mean is the reference for the next one."""
 _LOUDER = 2.0
 _FLOOR = 1e-3
-"""rad/s: motion below this is not told from noise."""
+"""rad/s: slower motion cannot be distinguished from noise."""
 _FASTEST_BIAS = np.deg2rad(10.0)
 _QUIETEST = 0.05
-"""Quantile over windows of their scatter: what the sensor's own noise is."""
+"""Quantile over windows of their standard deviation, taken as the sensor's own noise."""
 _LEAST_HEAD_S = 3.0
 _LATE_S = 0.5
-"""By so much a tracker's clock may be off; this much of the rest's ends is not used."""
+"""Largest error of the tracker's clock, s; this much is left out at the ends of the interval."""
 _LONGEST_GAP = 1.5
 _LEAST_SAMPLES = 20
 _OUTLYING = 6.0
@@ -41,7 +44,7 @@ _TURNS_SIGMAS, _LEAST_TURN = 6.0, np.deg2rad(0.1)
 
 
 class Scatter(NamedTuple):
-    """Standard deviation of a tracker's samples at rest, of three axes, with 95 % intervals."""
+    """Standard deviation of a tracker's static samples, three axes, with 95 % intervals."""
 
     value: Floats
     """(3,) rad in the body frame, or metres in the reference frame."""
@@ -49,16 +52,17 @@ class Scatter(NamedTuple):
     high: Floats
     samples: int
     wander: float
-    """Deviation about the mean over that of neighbours: 1 where samples are independent."""
+    """Standard deviation about the mean over that from differences of neighbours: 1 for independent
+    samples."""
 
     @property
     def wanders(self) -> bool:
-        """Whether samples are plainly not independent: the deviation of neighbours then says too little."""
+        """Whether samples are clearly correlated, so that `value` is too small."""
         return self.wander > _WANDERS
 
 
 class TrackerNoise(NamedTuple):
-    """A tracker of a tool at rest; None for what it does not tell."""
+    """Noise of a static tracker; None for a quantity that it does not measure."""
 
     optical: Scatter | None
     position: Scatter | None
@@ -66,10 +70,14 @@ class TrackerNoise(NamedTuple):
 
 
 def static_head(recording: Recording) -> float:
-    """Seconds from the IMU's first sample for which the run rests.
+    """Seconds from the IMU's first sample during which the run is static.
 
-    The gyroscope stays within its own scatter of a constant, half a second at a time. Raises
-    `RecordingError` where that is under 3 s, or where the tracker turns on steadily meanwhile.
+    The gyroscope stays within its own scatter of a constant, half a second at a time.
+
+    Raises
+    ------
+    RecordingError
+        If the interval is shorter than 3 s, or if the tracker rotates steadily during it.
     """
     place = str(recording.path or recording.name)
     imu = recording.need_imu()
@@ -79,15 +87,15 @@ def static_head(recording: Recording) -> float:
             place,
             f"{found:.1f} s of rest at the start",
             f"{_LEAST_HEAD_S:.0f} s or more in which the gyroscope stays quiet",
-            "a run that begins at rest, or --from and --to of a stretch that rests",
+            "a run that begins at rest, or --from and --to of a static interval",
         )
     if recording.optical is not None:
-        _need_no_turn(recording.optical, imu, found, place)
+        _require_no_rotation(recording.optical, imu, found, place)
     return found
 
 
 def quiet_s(imu: Imu) -> float:
-    """Seconds from the first sample for which the gyroscope stays quiet; 0 where it does not begin so."""
+    """Seconds from the first sample during which the gyroscope is static; 0 if it moves from the start."""
     t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     label = np.floor(t / _WINDOW_S).astype(int)
     count = np.bincount(label).astype(float)
@@ -99,8 +107,8 @@ def quiet_s(imu: Imu) -> float:
     off = imu.gyroscope - mean[label]
     scatter = np.sqrt(np.stack([np.bincount(label, c * c) for c in off.T], axis=1) / held)
     own = np.quantile(scatter[:-1], _QUIETEST, axis=0) + _FLOOR
-    # A window is compared with those before it, so that motion does not hide itself; not with all of them,
-    # so that a bias may drift over hours.
+    # The reference of a window is the mean of those before it, so that motion does not change its own
+    # reference, and of a limited number, so that a bias may drift over hours.
     total, row = np.cumsum(mean, axis=0), np.arange(len(mean))
     far = np.where((row >= _REMEMBERED)[:, None], total[np.maximum(row - _REMEMBERED, 0)], 0.0)
     before = (total - far) / np.minimum(row + 1, _REMEMBERED)[:, None]
@@ -110,12 +118,12 @@ def quiet_s(imu: Imu) -> float:
     moving = np.flatnonzero(~quiet)
     if moving.size == 0:
         return float(t[-1])
-    # The motion may have begun softly in the window before.
+    # Slow motion may have begun in the window before.
     return max(0.0, float(moving[0] - 1) * _WINDOW_S)
 
 
 def cut_imu(imu: Imu, begin_s: float, end_s: float) -> Imu:
-    """The samples from `begin_s` to `end_s` seconds after the first."""
+    """The samples from `begin_s` to `end_s`, seconds after the first."""
     t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     chosen = (t >= begin_s) & (t <= end_s)
     return replace(
@@ -130,10 +138,19 @@ def cut_imu(imu: Imu, begin_s: float, end_s: float) -> Imu:
 def tracker_noise(
     recording: Recording, begin_s: float, end_s: float, last_s: float
 ) -> TrackerNoise:
-    """Scatter of the tracker while the run rests, from `begin_s` to `end_s` of the IMU's time.
+    """Noise of the tracker while the run is static.
 
-    From the differences of neighbours, so that a slow drift does not count; half a second is left out at
-    ends that are not those of the run, which takes `last_s`.
+    The estimate uses differences of neighbours, so that slow drift does not count. Half a second is
+    left out at ends that are not those of the run.
+
+    Parameters
+    ----------
+    recording
+        The run.
+    begin_s, end_s
+        Static interval, s from the IMU's first sample.
+    last_s
+        Length of the run, s.
     """
     start = recording.need_imu().time_ns[0]
     begin = begin_s + _LATE_S if begin_s > 0.0 else -np.inf
@@ -142,22 +159,22 @@ def tracker_noise(
     if recording.optical is not None:
         stream = recording.optical
         t = (stream.time_ns - stream.latency_ns - start) / NANOSECONDS
-        seen = stream.valid & (t >= begin) & (t <= end)
-        optical = _attitude_scatter(stream, seen)
+        valid = stream.valid & (t >= begin) & (t <= end)
+        optical = _attitude_scatter(stream, valid)
         if stream.position is not None:
-            position = _scatter([stream.position], stream.time_ns, [seen])
+            position = _scatter([stream.position], stream.time_ns, [valid])
     if recording.markers is not None:
         marker = _marker_scatter(recording.markers, start, begin, end)
     return TrackerNoise(optical, position, marker)
 
 
-def _attitude_scatter(stream: Optical, seen: Flags) -> Scatter | None:
-    """Of rotation vectors from the first seen attitude, body frame: small where all rests."""
-    if seen.sum() < _LEAST_SAMPLES:
+def _attitude_scatter(stream: Optical, valid: Flags) -> Scatter | None:
+    """Scatter of the rotation vectors from the mean attitude, body frame."""
+    if valid.sum() < _LEAST_SAMPLES:
         return None
     attitude = to_scipy(stream.q_ref_body)
-    middle = to_scipy(stream.q_ref_body[seen]).mean()
-    return _scatter([(middle.inv() * attitude).as_rotvec()], stream.time_ns, [seen])
+    middle = to_scipy(stream.q_ref_body[valid]).mean()
+    return _scatter([(middle.inv() * attitude).as_rotvec()], stream.time_ns, [valid])
 
 
 def _marker_scatter(markers: Markers, start: int, begin: float, end: float) -> Scatter | None:
@@ -168,15 +185,15 @@ def _marker_scatter(markers: Markers, start: int, begin: float, end: float) -> S
     return _scatter(places, markers.time_ns, [markers.usable[:, i] & inside for i in range(count)])
 
 
-def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter | None:
-    """Of several series (N, 3) of one deviation: half the mean square of differences of neighbours.
+def _scatter(values: list[Floats], time_ns: Times, valid: list[Flags]) -> Scatter | None:
+    """Scatter of series (N, 3) that share one deviation: half the mean square of differences of neighbours.
 
-    Of ``n`` differences that has ``2 n^2 / (3 n - 1)`` degrees of freedom (von Neumann). Differences far
-    beyond the others are outliers and are left out.
+    The estimate from ``n`` differences has ``2 n^2 / (3 n - 1)`` degrees of freedom (von Neumann). Outliers
+    among the differences are left out.
     """
     steps, about = [], []
-    for value, valid in zip(values, seen, strict=True):
-        rows = np.flatnonzero(valid)
+    for value, mask in zip(values, valid, strict=True):
+        rows = np.flatnonzero(mask)
         near = np.diff(time_ns[rows]) <= _LONGEST_GAP * period_ns(time_ns)
         steps.append(np.diff(value[rows], axis=0)[near])
         if rows.size:
@@ -193,15 +210,14 @@ def _scatter(values: list[Floats], time_ns: Times, seen: list[Flags]) -> Scatter
     whole = np.median(np.abs(np.concatenate(about)), axis=0) / _MEDIAN
     return Scatter(
         found,
-        found * np.sqrt(freedom / chi_square.ppf(0.975, freedom)),
-        found * np.sqrt(freedom / chi_square.ppf(0.025, freedom)),
+        *chi_square.deviation_interval(found, freedom),
         len(step),
         float(np.max(whole / np.maximum(found, 1e-15))),
     )
 
 
-def _need_no_turn(optical: Optical, imu: Imu, end_s: float, place: str) -> None:
-    """A steady turn looks to a gyroscope like a bias; the tracker knows better."""
+def _require_no_rotation(optical: Optical, imu: Imu, end_s: float, place: str) -> None:
+    """Raise `RecordingError` if the tracker rotates steadily, which looks like a bias to the gyroscope."""
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     thirds = [
         optical.valid & (t >= share * end_s) & (t <= (share + 1.0 / 3.0) * end_s - _LATE_S / 2.0)
@@ -210,13 +226,13 @@ def _need_no_turn(optical: Optical, imu: Imu, end_s: float, place: str) -> None:
     if min(third.sum() for third in thirds) < _LEAST_SAMPLES:
         return
     first, last = (to_scipy(optical.q_ref_body[third]) for third in thirds)
-    turned = float((first.mean().inv() * last.mean()).magnitude())
+    rotated = float((first.mean().inv() * last.mean()).magnitude())
     own = float(np.sqrt(np.mean((first.mean().inv() * first).magnitude() ** 2)))
     bound = max(_TURNS_SIGMAS * own / np.sqrt(_LEAST_SAMPLES), _LEAST_TURN)
-    if turned > bound:
+    if rotated > bound:
         raise RecordingError(
             place,
-            f"a tracker that turns by {np.rad2deg(turned):.2f} deg in the first {end_s:.1f} s",
-            "a run that rests at its start",
-            "--from and --to of a stretch that rests",
+            f"a tracker that rotates by {np.rad2deg(rotated):.2f} deg in the first {end_s:.1f} s",
+            "a static run at its start",
+            "--from and --to of a static interval",
         )

@@ -1,4 +1,8 @@
-"""What the rest of a run, or a static log, tells of the noise of its sensors, as a start for tuning."""
+"""Sensor noise from a static recording, as initial values for tuning.
+
+`static_noise` measures, `start_for` writes the result into a model's parameters, `write_curve` and
+`as_dict` save it.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration import static_interval
 from jaxekf.calibration.allan import Curve, ImuNoise, SensorNoise, imu_noise
-from jaxekf.calibration.noise_densities import Estimated
+from jaxekf.calibration.noise_densities import Coefficient
 from jaxekf.calibration.static_interval import TrackerNoise
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import NANOSECONDS, Floats, Recording
@@ -19,7 +24,7 @@ _COLUMN_UNITS = {"rad/s": "rad_s", "m/s^2": "m_s2"}
 
 
 class StaticNoise(NamedTuple):
-    """Noise of the sensors of a run at rest."""
+    """Noise of the sensors of a static run."""
 
     run: str
     begin_s: float
@@ -30,29 +35,41 @@ class StaticNoise(NamedTuple):
 
     @property
     def sensors(self) -> dict[str, SensorNoise]:
-        """Gyroscope, and accelerometer where there is one."""
+        """Gyroscope and, if there is one, accelerometer."""
         found = {"gyroscope": self.imu.gyroscope}
         if self.imu.accelerometer is not None:
             found["accelerometer"] = self.imu.accelerometer
         return found
 
 
-class Start(NamedTuple):
-    """Parameters to tune from."""
+class NoiseStart(NamedTuple):
+    """Parameters to start tuning from."""
 
     params: Parameters
-    """The model's defaults, with the noise that was found."""
+    """The model's defaults with the measured noise."""
     taken: tuple[str, ...]
-    """Names of the noise that was found."""
+    """Names of the noise parameters that were measured."""
     sentences: tuple[str, ...]
-    """What was not found, and what to beware of."""
+    """Warnings, and reasons why a parameter keeps its default."""
 
 
 def static_noise(
     recording: Recording, begin_s: float | None = None, end_s: float | None = None
 ) -> StaticNoise:
-    """Noise from `begin_s` to `end_s`, seconds from the IMU's first sample; without either from the time
-    that the run rests at its start. Raises `RecordingError` where that is too short: `rest.static_head`.
+    """Noise of a static interval.
+
+    Parameters
+    ----------
+    recording
+        The run.
+    begin_s, end_s
+        Static interval, s from the IMU's first sample. Without either, the static interval at the start of
+        the run is found by `static_interval.static_head`.
+
+    Raises
+    ------
+    RecordingError
+        If the interval is too short or outside the run.
     """
     imu = recording.need_imu()
     last = float(imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
@@ -77,23 +94,23 @@ def static_noise(
     )
 
 
-def start_for(model: Model, found: StaticNoise) -> Start:
-    """The model's defaults with the noise that was found, axis by axis.
+def start_for(model: Model, found: StaticNoise) -> NoiseStart:
+    """The model's defaults with the measured noise, axis by axis.
 
-    A bias walk that the rest is too short to tell keeps its default, or the upper end of its interval
-    where that is less.
+    A bias walk that is not significant keeps its default, or the upper end of its confidence interval
+    if that is smaller.
     """
     noise, units = model.parameters.noise, model.units.noise
     known = _known(found)
     changes: dict[str, Any] = {}
     sentences = []
     for name, (value, unit) in known.items():
-        # The same name in another unit is another thing, such as a deviation of samples.
+        # The same name in another unit is another quantity, such as a deviation of samples.
         if unit != getattr(units, name, None):
             continue
         if not np.all(value > 0.0):
             sentences.append(
-                f"{name} is zero on an axis, which no filter takes: the default is kept"
+                f"{name} is zero on an axis, which a filter cannot use: the default is kept"
             )
             continue
         changes[name] = value
@@ -104,24 +121,24 @@ def start_for(model: Model, found: StaticNoise) -> Start:
                 changes[name] = value
             sentences += text
     for label, sensor in found.sensors.items():
-        bands, half = [made.band_hz for made in sensor.axes], 0.5 / sensor.curve.tau[0]
+        bands, half = [axis_noise.band_hz for axis_noise in sensor.axes], 0.5 / sensor.curve.tau[0]
         if min(bands) < 0.9 * half and label in changes:
             sentences.append(
-                f"{label}: densities hold up to {min(bands):.2g} Hz; from there to {half:.3g} Hz the noise"
-                " is not white"
+                f"{label}: densities are valid up to {min(bands):.2g} Hz; from there to {half:.3g} Hz the"
+                " noise is not white"
             )
     for label, scatter in found.tracker._asdict().items():
         if scatter is not None and scatter.wanders and label in changes:
             sentences.append(
-                f"{label}: about their mean samples scatter {scatter.wander:.1f} times more than from one"
-                " to the next: they are filtered or drift, and what a filter needs lies between"
+                f"{label}: the deviation about the mean is {scatter.wander:.1f} times that from sample to"
+                " sample: the samples are filtered or drift, and the right noise is between the two"
             )
     params = model.parameters._replace(noise=noise._replace(**changes))
-    return Start(params, tuple(changes), tuple(sentences))
+    return NoiseStart(params, tuple(changes), tuple(sentences))
 
 
 def _known(found: StaticNoise) -> dict[str, tuple[Floats, str]]:
-    """Deviations and densities by the names that models give them, with their units."""
+    """Deviations and densities by the names that models use, with their units."""
     known = {
         name: (sensor.white, f"{sensor.unit}/sqrt(Hz)") for name, sensor in found.sensors.items()
     }
@@ -140,28 +157,28 @@ def _walks(found: StaticNoise) -> dict[str, SensorNoise]:
 def _walk(
     name: str, sensor: SensorNoise, default: Floats, found: StaticNoise
 ) -> tuple[Floats | None, list[str]]:
-    """The walk of each axis where it was found, and a sentence on those where it was not."""
+    """The walk of each axis if it is significant, and a sentence on the other axes."""
     walks = [axis.walk_alone for axis in sensor.axes]
-    told = np.array([walk.found for walk in walks])
-    if told.all():
+    significant = np.array([walk.significant for walk in walks])
+    if significant.all():
         return np.array([walk.value for walk in walks]), []
     high = np.array([walk.high for walk in walks])
     usual = np.broadcast_to(default if default.ndim < 2 else np.diagonal(default), (3,))
-    value = np.where(told, [walk.value for walk in walks], np.minimum(usual, high))
+    value = np.where(significant, [walk.value for walk in walks], np.minimum(usual, high))
     limits = ", ".join(
-        f"{shown(high[i], sensor.unit, '/s/√Hz')} ({AXES[i]})" for i in np.flatnonzero(~told)
+        f"{shown(high[i], sensor.unit, '/s/√Hz')} ({AXES[i]})" for i in np.flatnonzero(~significant)
     )
-    kept = "the default is kept" if np.all(usual <= high) else "no more is taken"
+    kept = "the default is kept" if np.all(usual <= high) else "the bound is used"
     sentence = (
-        f"{name}: {found.imu.duration_s:.0f} s do not tell a random walk of the bias, only that it is below"
-        f" {limits}; {kept}"
+        f"{name}: {found.imu.duration_s:.0f} s are too short to estimate a random walk of the bias; it is"
+        f" below {limits}; {kept}"
     )
-    unchanged = not told.any() and bool(np.all(usual <= high))
+    unchanged = not significant.any() and bool(np.all(usual <= high))
     return (None if unchanged or not np.all(value > 0.0) else value), [sentence]
 
 
 def shown(value: float, unit: str, suffix: str) -> str:
-    """A number with its unit for people: degrees for radians."""
+    """A number with its unit for display, degrees for radians."""
     if unit.startswith("rad"):
         value, unit = float(np.rad2deg(value)), unit.replace("rad", "deg", 1)
     return f"{value:.2g} {_pretty(unit + suffix)}"
@@ -172,8 +189,10 @@ def _pretty(unit: str) -> str:
 
 
 def curve_table(found: StaticNoise) -> tuple[list[str], Floats]:
-    """The Allan deviation as columns: `tau_s`, then of every sensor and axis deviation, low and high, the
-    unit in each name."""
+    """The Allan deviation as columns: `tau_s`, then deviation, low and high of each sensor and axis.
+
+    The unit is in each column name.
+    """
     columns, values = ["tau_s"], [found.imu.gyroscope.curve.tau[:, None]]
     for label, sensor in found.sensors.items():
         unit = _COLUMN_UNITS[sensor.unit]
@@ -184,7 +203,7 @@ def curve_table(found: StaticNoise) -> tuple[list[str], Floats]:
 
 
 def as_dict(found: StaticNoise) -> dict[str, Any]:
-    """All of it as a JSON document, in SI units, without the curve."""
+    """The result as a JSON document, in SI units, without the curve."""
     document: dict[str, Any] = {
         "run": found.run,
         "begin_s": found.begin_s,
@@ -196,16 +215,16 @@ def as_dict(found: StaticNoise) -> dict[str, Any]:
         floor, at = sensor.floor()
         document[label] = {"unit": sensor.unit}
         for i, axis in enumerate(AXES):
-            made = sensor.axes[i]
+            axis_noise = sensor.axes[i]
             document[label][axis] = {
-                "white": _interval(made.white),
-                "walk": _interval(made.walk),
-                "walk_standing_for_flicker": _interval(made.walk_alone),
-                "flicker": made.flicker,
-                "quantisation": made.quantisation,
+                "white": _interval(axis_noise.white),
+                "walk": _interval(axis_noise.walk),
+                "walk_standing_for_flicker": _interval(axis_noise.walk_alone),
+                "flicker": axis_noise.flicker,
+                "quantisation": axis_noise.quantisation,
                 "floor": float(floor[i]),
                 "floor_at_s": float(at[i]),
-                "fitted_up_to_hz": made.band_hz,
+                "fitted_up_to_hz": axis_noise.band_hz,
             }
     for label, scatter in found.tracker._asdict().items():
         if scatter is not None:
@@ -220,8 +239,8 @@ def as_dict(found: StaticNoise) -> dict[str, Any]:
     return document
 
 
-def _interval(estimated: Estimated) -> dict[str, Any]:
-    return estimated._asdict() | {"found": estimated.found}
+def _interval(estimated: Coefficient) -> dict[str, Any]:
+    return estimated._asdict() | {"found": estimated.significant}
 
 
 def write_curve(path: Path, found: StaticNoise) -> None:
@@ -229,3 +248,6 @@ def write_curve(path: Path, found: StaticNoise) -> None:
     columns, values = curve_table(found)
     rows: Sequence[str] = [",".join(f"{value:.9g}" for value in row) for row in values]
     path.write_text("\n".join([",".join(columns), *rows]) + "\n", "utf-8")
+
+
+__getattr__ = renamed(__name__, "Start>NoiseStart")

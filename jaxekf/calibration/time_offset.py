@@ -1,7 +1,9 @@
-"""How one clock and one frame lie to another, found from the angular rates that both streams tell.
+"""Time offset and rotation between a tracker and an IMU, from the angular rates that both measure.
 
-The tracker's turn from one sample to the next is the integral of the gyroscope's rate over the same time,
-in the same frame. What has to be added to the stamps, and how the frames lie, follows by least squares.
+The rotation of the tracker from sample to sample equals the integral of the gyroscope's rate over the same
+time, in the same frame. A coarse lag search by correlation needs no frames; Gauss-Newton then estimates
+latency, tracker-to-IMU rotation and gyroscope bias together. `attitude_alignment.refine` improves the
+result.
 """
 
 from dataclasses import dataclass
@@ -12,194 +14,214 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.motion_agreement import Integral, pairs_of, turn_between
+from jaxekf.calibration.motion_agreement import (
+    Integral,
+    best_lag,
+    limiting_weights,
+    rotation_vectors,
+    sample_pairs,
+)
+from jaxekf.geometry.host_rotation import nearest_rotation, skew
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, period_ns, to_scipy
 
 _LARGEST_S = 0.5
+"""Largest latency, s, that is accepted."""
 _LONGEST_GAP = 2.5
-"""Periods between two samples over which a turn still counts."""
+"""Sampling periods between two samples up to which a relative rotation is used."""
 _FEWEST = 50
+"""Fewest relative rotations."""
 _COARSE = 6000
-"""Turns among which the latency is searched for."""
-_OUTLYING = 5.0
+"""Relative rotations that the coarse search uses."""
+_OUTLIER_RATIO = 5.0
+"""Residuals larger than the median by this factor are outliers."""
 _ROUNDS = 12
 _CORRELATED = 8
 """Samples over which residuals are taken to be correlated."""
 _LARGEST_SIGMA_S = 0.005
+"""Largest accepted standard deviation of the latency, s."""
 _BLOCK_S, _LOCAL = 0.2, 20
-"""Seconds over which rates are compared, and blocks whose mean is taken off."""
-_SURE = 1.0 - 1e-9
-_BY_CHANCE = 8.0
-"""Deviations that a correlation of noise does not reach, with lag and frame fitted to it."""
+"""Seconds over which rates are compared, and blocks whose mean is subtracted."""
+_LARGEST_CORRELATION = 1.0 - 1e-9
+_SIGNIFICANT = 8.0
+"""Standard deviations that the correlation of pure noise, with lag and frame fitted to it, does not
+reach."""
 
 
 @dataclass(frozen=True)
 class Match:
-    """How a tracker lies to an IMU in time and frame."""
+    """Time offset and rotation of a tracker relative to an IMU."""
 
     latency_s: float
-    """Seconds that the tracker's samples are older than stamped, by the IMU's clock."""
+    """Seconds by which the tracker's samples are older than stamped, on the IMU's clock."""
     latency_sigma_s: float
+    """Its standard deviation, s."""
     alignment: Floats
-    """(3,) rotation vector, rad, that takes vectors of the tracked frame into the IMU's, as
-    `calibration.alignment` of `loose_pose` and `tight` does: where the tracker's rate, in its own frame,
-    is ``exp(alignment)' (gyroscope - bias)``."""
+    """(3,) rotation vector, rad, from tool frame to IMU frame, as `calibration.alignment` of `loose_pose`
+    and `tight`. The tracker's rate, in the tool frame, is ``exp(alignment)' (gyroscope - bias)``."""
     alignment_sigma: Floats
-    """(3,) rad: large about an axis where all turning was about that axis, too."""
+    """(3,) standard deviations, rad; large about an axis if all rotation was about that axis."""
     bias: Floats
-    """(3,) rad/s, of the gyroscope."""
+    """(3,) rad/s, gyroscope bias, IMU frame."""
     turns: int
-    """Turns from sample to sample that were used; outliers are not."""
+    """Relative rotations that were used, outliers excluded."""
 
 
-class _Turns(NamedTuple):
-    """Turns of the tracker from sample to sample."""
+class _Rotations(NamedTuple):
+    """Rotations of the tracker from sample to sample."""
 
     begin: Floats
-    """(N,) seconds of the IMU's first sample on, as stamped."""
+    """(N,) s from the IMU's first sample, as stamped."""
     end: Floats
     turn: Floats
-    """(N, 3) rotation vectors, rad."""
+    """(N, 3) rotation vectors, rad, tool frame."""
 
 
 def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
-    """Latency of the tracker against the IMU, up to half a second, and how their frames lie.
+    """Latency of a tracker relative to an IMU, up to half a second, and the rotation between their frames.
 
-    Raises `RecordingError` where there are too few turns, so little motion that the latency is not known to
-    5 ms, or where it would be half a second or more: it is then refused, not guessed.
+    Parameters
+    ----------
+    optical
+        Attitudes of the tool.
+    imu
+        Rates of the IMU.
+    place
+        Name of the recording for error messages.
+
+    Raises
+    ------
+    RecordingError
+        If there are fewer than 50 relative rotations, if the motion determines the latency to no
+        better than 5 ms, or if the latency is half a second or more.
     """
-    turns = _turns(optical, imu)
+    turns = _relative_rotations(optical, imu)
     if len(turns.turn) < _FEWEST:
         raise RecordingError(
             str(place),
             f"{len(turns.turn)} pairs of tracker samples within the IMU's time",
             f"{_FEWEST} or more to match the clocks by",
-            "a longer recording, or one in which the tool is seen",
+            "a longer recording, or one in which the tool is visible",
         )
-    seconds = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
-    steps = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * np.diff(seconds)[:, None]
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    integral = CubicHermiteSpline(seconds, angle, imu.gyroscope)
-    latency = _coarse(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
-    found = _refined(turns, integral, latency)
+    linear = Integral(imu.time_ns, imu.gyroscope)
+    integral = CubicHermiteSpline(linear.t, linear.sums, imu.gyroscope)
+    latency = _coarse_latency(turns, integral, period_ns(optical.time_ns) / NANOSECONDS)
+    found = _gauss_newton(turns, integral, latency)
     if abs(found.latency_s) >= _LARGEST_S:
         raise RecordingError(
             str(place),
-            f"tracker and gyroscope that agree best {found.latency_s:+.2f} s apart",
+            f"a latency of {found.latency_s:+.2f} s between tracker and gyroscope",
             f"clocks within {_LARGEST_S:g} s of each other",
-            "shifting the times of one of them first",
+            "shifting the times of one stream first",
         )
     if not found.latency_sigma_s <= _LARGEST_SIGMA_S:
         raise RecordingError(
             str(place),
-            f"so little turning that the latency is known to {1e3 * found.latency_sigma_s:.0f} ms only",
+            f"too little rotation: the latency is known to {1e3 * found.latency_sigma_s:.0f} ms only",
             f"{1e3 * _LARGEST_SIGMA_S:.0f} ms or better",
-            "a recording in which the tool turns about several axes, faster and slower",
+            "a recording in which the tool rotates about several axes at varying speed",
         )
-    _need_changes(optical, imu, found, place)
+    _require_rate_changes(optical, imu, linear, found, place)
     return found
 
 
-def _need_changes(optical: Optical, imu: Imu, found: Match, place: object) -> None:
-    """Both streams tell the same changes of rate, or the latency is that of noise.
+def _require_rate_changes(
+    optical: Optical, imu: Imu, integral: Integral, found: Match, place: object
+) -> None:
+    """Raise `RecordingError` unless both streams share the same changes of rate.
 
-    Where the rate is constant, its changes are the gyroscope's noise, in which some lag always fits best,
-    and as sharply as if they were motion. Only what the tracker shares is.
+    At constant rate the only changes are the gyroscope's noise. Some lag always fits that noise best,
+    and as sharply as motion, so the changes must also be present in the tracker.
     """
-    seen = np.flatnonzero(optical.valid)
-    t = (optical.time_ns[seen] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
-    integral = Integral(imu.time_ns, imu.gyroscope)
-    period = period_ns(optical.time_ns) / NANOSECONDS
-    span = max(_BLOCK_S, period)
+    rows = np.flatnonzero(optical.valid)
+    t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
+    span = max(_BLOCK_S, period_ns(optical.time_ns) / NANOSECONDS)
     last = float(integral.t[-1])
-    begin, end = pairs_of(t, span, last, max(1, int((t[-1] - t[0]) / span)))
-    q = optical.q_ref_body[seen]
-    lasts = (t[end] - t[begin])[:, None]
-    turned = turn_between(q[begin], q[end]) / lasts
-    said = integral.between(t[begin] - found.latency_s, t[end] - found.latency_s) / lasts
-    said = Rotation.from_rotvec(found.alignment).inv().apply(said)
-    size = np.linalg.norm(turned, axis=1)
-    kept = size <= _OUTLYING * max(float(np.quantile(size, 0.9)), 1e-12)
-    one, other = (_less_local_mean(rates[kept]) for rates in (turned, said))
+    begin, end = sample_pairs(t, span, last, max(1, int((t[-1] - t[0]) / span)))
+    q = optical.q_ref_body[rows]
+    durations = (t[end] - t[begin])[:, None]
+    tracked = rotation_vectors(q[begin], q[end]) / durations
+    integrated = integral.between(t[begin] - found.latency_s, t[end] - found.latency_s) / durations
+    integrated = Rotation.from_rotvec(found.alignment).inv().apply(integrated)
+    size = np.linalg.norm(tracked, axis=1)
+    kept = size <= _OUTLIER_RATIO * max(float(np.quantile(size, 0.9)), 1e-12)
+    one, other = (_remove_local_mean(rates[kept]) for rates in (tracked, integrated))
     shared = float(np.sum(one * other))
     squares = float(np.sum(one**2) * np.sum(other**2))
-    likeness = shared / np.sqrt(squares) if squares > 0.0 else 0.0
-    # Fisher's transform: of few blocks, too, a correlation near one is none of chance.
-    deviations = np.arctanh(np.clip(likeness, -_SURE, _SURE)) * np.sqrt(max(one.size - 3, 1))
-    if deviations < _BY_CHANCE:
+    correlation = shared / np.sqrt(squares) if squares > 0.0 else 0.0
+    # Fisher's transform makes the bound right for few blocks, too.
+    scale = np.sqrt(max(one.size - 3, 1))
+    limited = np.clip(correlation, -_LARGEST_CORRELATION, _LARGEST_CORRELATION)
+    if np.arctanh(limited) * scale < _SIGNIFICANT:
         raise RecordingError(
             str(place),
-            "so little turning faster and slower that tracker and gyroscope are alike by chance only"
-            f" (correlation {likeness:.2f})",
-            f"{np.tanh(_BY_CHANCE / np.sqrt(max(one.size - 3, 1))):.2f} or more",
-            "a recording in which the tool turns about several axes, faster and slower",
+            "too little rotation of varying speed: tracker and gyroscope do not correlate"
+            f" (correlation {correlation:.2f})",
+            f"{np.tanh(_SIGNIFICANT / scale):.2f} or more",
+            "a recording in which the tool rotates about several axes at varying speed",
         )
 
 
-def _less_local_mean(rates: Floats) -> Floats:
-    """Rates (N, 3) less the mean of those about them: no constant turning, no wandering bias."""
+def _remove_local_mean(rates: Floats) -> Floats:
+    """Rates (N, 3) minus their local mean, which removes constant rotation and a drifting bias."""
     groups = np.arange(len(rates)) // _LOCAL
     count = np.bincount(groups)[:, None]
     total = np.stack([np.bincount(groups, rates[:, i]) for i in range(3)], axis=1)
     return rates - (total / count)[groups]
 
 
-def _turns(optical: Optical, imu: Imu) -> _Turns:
-    seen = np.flatnonzero(optical.valid)
-    times = (optical.time_ns - optical.latency_ns - imu.time_ns[0])[seen] / NANOSECONDS
-    attitude = to_scipy(optical.q_ref_body[seen])
+def _relative_rotations(optical: Optical, imu: Imu) -> _Rotations:
+    rows = np.flatnonzero(optical.valid)
+    times = (optical.time_ns - optical.latency_ns - imu.time_ns[0])[rows] / NANOSECONDS
+    attitude = to_scipy(optical.q_ref_body[rows])
     turn = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
     span = np.diff(times)
     last = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
     kept = span <= _LONGEST_GAP * period_ns(optical.time_ns) / NANOSECONDS
     kept &= (times[:-1] >= _LARGEST_S) & (times[1:] <= last - _LARGEST_S)
-    return _Turns(times[:-1][kept], times[1:][kept], turn[kept])
+    return _Rotations(times[:-1][kept], times[1:][kept], turn[kept])
 
 
-def _coarse(turns: _Turns, integral: CubicHermiteSpline, period_s: float) -> float:
-    """The latency at which both turn alike fast, whatever their frames: the best correlation."""
-    # Of a long run some are enough to tell so roughly.
-    turns = _Turns(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
+def _coarse_latency(turns: _Rotations, integral: CubicHermiteSpline, period_s: float) -> float:
+    """The latency, s, at which the rotation speeds correlate best; independent of the frames."""
+    # A subset is enough for a rough estimate.
+    turns = _Rotations(*(field[:: max(1, len(field) // _COARSE)] for field in turns))
     span = turns.end - turns.begin
     speed = np.linalg.norm(turns.turn, axis=1) / span
-    # A wrong pose is a spike of speed, which would outweigh all motion.
+    # A wrong pose is a spike of speed, which would dominate the correlation.
     speed = np.minimum(speed, np.quantile(speed, 0.98))
-    speed = speed - speed.mean()
-    best, latency = -np.inf, 0.0
+
+    def gyroscope_speed(lag: float) -> Floats:
+        integrated = integral(turns.end - lag) - integral(turns.begin - lag)
+        return np.linalg.norm(integrated, axis=1) / span
+
     step = max(0.01, min(0.5 * period_s, 0.02))
-    for shift in np.arange(-_LARGEST_S, _LARGEST_S + step, step):
-        said = integral(turns.end - shift) - integral(turns.begin - shift)
-        other = np.linalg.norm(said, axis=1) / span
-        other = other - other.mean()
-        size = float(np.sqrt(np.sum(other**2)))
-        likeness = float(speed @ other) / size if size > 0.0 else -np.inf
-        if likeness > best:
-            best, latency = likeness, float(shift)
-    return latency
+    lags = np.arange(-_LARGEST_S, _LARGEST_S + step, step)
+    return best_lag(speed[None], gyroscope_speed, lags)
 
 
-def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Match:
-    """Latency, alignment and bias together by Gauss and Newton, wrong turns left out."""
+def _gauss_newton(turns: _Rotations, integral: CubicHermiteSpline, latency: float) -> Match:
+    """Latency, alignment and bias by Gauss-Newton, outliers left out."""
     rate = integral.derivative()
     span = turns.end - turns.begin
-    said = integral(turns.end - latency) - integral(turns.begin - latency)
-    turn = _between(said, turns.turn)
+    integrated = integral(turns.end - latency) - integral(turns.begin - latency)
+    weight = limiting_weights(turns.turn, 0.98)
+    turn = Rotation.from_matrix(nearest_rotation((weight * turns.turn).T @ integrated))
     kept = np.ones(len(span), bool)
     design, solution, residual = np.zeros((len(span), 3, 7)), np.zeros(7), turns.turn
     design[:, :, 3:6] = -span[:, None, None] * np.eye(3)
     for _ in range(_ROUNDS):
-        said = turn.apply(integral(turns.end - latency) - integral(turns.begin - latency))
-        swing = rate(turns.end - latency) - rate(turns.begin - latency)
-        design[:, :, :3] = -_crossing(said)
-        design[:, :, 6] = -turn.apply(swing)
-        flat, missed = design[kept].reshape(-1, 7), turns.turn - said
+        integrated = turn.apply(integral(turns.end - latency) - integral(turns.begin - latency))
+        rate_change = rate(turns.end - latency) - rate(turns.begin - latency)
+        design[:, :, :3] = -skew(integrated)
+        design[:, :, 6] = -turn.apply(rate_change)
+        flat, missed = design[kept].reshape(-1, 7), turns.turn - integrated
         solution = np.linalg.lstsq(flat, missed[kept].ravel(), rcond=None)[0]
         residual = missed - np.einsum("nij,j->ni", design, solution)
         turn = Rotation.from_rotvec(solution[:3]) * turn
         latency = float(np.clip(latency + np.clip(solution[6], -0.02, 0.02), -1.0, 1.0))
         size = np.linalg.norm(residual, axis=1)
-        kept = size <= _OUTLYING * max(float(np.median(size)), 1e-12)
-    sigma = np.sqrt(np.diagonal(_sandwich(design, residual, kept)))
+        kept = size <= _OUTLIER_RATIO * max(float(np.median(size)), 1e-12)
+    sigma = np.sqrt(np.diagonal(_robust_covariance(design, residual, kept)))
     frame = turn.inv()
     return Match(
         latency,
@@ -211,26 +233,10 @@ def _refined(turns: _Turns, integral: CubicHermiteSpline, latency: float) -> Mat
     )
 
 
-def _between(a: Floats, b: Floats) -> Rotation:
-    """The rotation that takes vectors (N, 3) nearest to others (Wahba), those of wrong poses cut short."""
-    size = np.linalg.norm(b, axis=1)
-    weight = np.minimum(1.0, np.quantile(size, 0.98) / np.maximum(size, 1e-12))
-    u, _, vt = np.linalg.svd((weight[:, None] * b).T @ a)
-    return Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+def _robust_covariance(design: Floats, residual: Floats, kept: Flags) -> Floats:
+    """Covariance of a least-squares solution with autocorrelated residuals (Newey-West).
 
-
-def _crossing(vectors: Floats) -> Floats:
-    """Matrices (N, 3, 3) that multiply by a vector in a cross product, ``a x``."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _sandwich(design: Floats, residual: Floats, kept: Flags) -> Floats:
-    """Covariance of a least-squares solution whose residuals are correlated over a few samples.
-
-    The noise of a sample is in the turn to it and the turn from it, so that most of it cancels.
+    The noise of one sample enters two relative rotations with opposite sign, so most of it cancels.
     """
     score = np.einsum("nij,ni->nj", design, residual) * kept[:, None]
     middle = score.T @ score
@@ -239,7 +245,7 @@ def _sandwich(design: Floats, residual: Floats, kept: Flags) -> Floats:
         middle += (1.0 - lag / (_CORRELATED + 1.0)) * (cross + cross.T)
     flat = design[kept].reshape(-1, design.shape[2])
     inverse = np.linalg.pinv(flat.T @ flat)
-    # Where the noise cancels to nothing, and beyond, half of the naive variance is still claimed.
+    # Lower bound for the case that the correlated noise cancels almost completely.
     naive = inverse * float(np.sum(residual[kept] ** 2)) / max(flat.shape[0] - flat.shape[1], 1)
     cov = inverse @ middle @ inverse
     short = np.diagonal(cov) < 0.05 * np.diagonal(naive)

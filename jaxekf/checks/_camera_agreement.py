@@ -1,7 +1,7 @@
-"""What the images of a camera say of its lens, its landmarks and the IMU: poses of single images, compared.
+"""Agreement of a camera's images with its lens, its landmarks and the IMU, by single-image poses.
 
-An image's own pose fits badly, or not at all, where the lens or the names or places of landmarks are wrong;
-where it fits, its turns and distances are those of the IMU, or not.
+The pose of an image fits badly, or not at all, if lens parameters, landmark names or landmark positions are
+wrong. Where it fits, its rotations and distances are compared with the IMU's.
 """
 
 from dataclasses import replace
@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.alignment import align, is_late, turned_deg
+from jaxekf.calibration.alignment import align, has_latency, misalignment_deg
 from jaxekf.calibration.attitude_alignment import AttitudeMatch
 from jaxekf.checks.plausibility import (
     FARTHEST_M,
     LEAST_RATE,
     check_gravity,
-    fault,
+    length_fault,
     path_unit,
+    rate_fault,
     rates_unit,
 )
 from jaxekf.checks.sensor_agreement import ALIKE, Evidence, evidence
@@ -25,30 +26,31 @@ from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.types import Camera, Flags, Recording
 
 _MOST_IMAGES, _TRIED = 1500, 60
-"""Images that are solved for, in the middle of a run, and of a camera whose images fit no pose, since that
-takes long to see."""
+"""Images that are solved, from the middle of a run, and images that are tried first: a camera without any
+valid pose is slow."""
 _FEW_FIT = 0.5
 _PIXELS, _TIMES = 3.0, 2.0
-"""Points off by so much, and by so many of their reported deviations, are not found badly but placed."""
+"""Bounds on the reprojection error, pixels and multiples of the reported deviation; a larger error means
+wrong geometry, not detection noise."""
 _RATE_OFF, _LENGTH_OFF = 0.05, 0.2
 _EXPLAINED = 0.5
 
 
 class CameraEvidence(NamedTuple):
-    """What was measured of the images in the middle of a run, 1,500 at most."""
+    """Measurements on the images in the middle of a run, 1,500 at most."""
 
     images: int
-    """Those with six landmarks or more."""
+    """Images with six landmarks or more."""
     posed: int
-    """Of them, those that a pose fits."""
+    """Images with a valid pose."""
     error_px: float
-    """Median of the robust deviations of points about their image's pose; NaN where none has one."""
+    """Median over images of the robust reprojection error, pixels; NaN without poses."""
     sigma_px: float
-    """Median reported deviation of points; 0 where none was reported."""
+    """Median reported deviation of points, pixels; 0 if none was reported."""
     imu: Evidence
-    """Of the poses as a tracker's, and the IMU."""
+    """Agreement of the camera's poses, taken as a tracker's, with the IMU."""
     match: AttitudeMatch | None
-    """Clock and frame of the poses against the IMU; None where these do not tell."""
+    """Clock and rotation of the poses relative to the IMU; None if they could not be estimated."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -62,19 +64,19 @@ class CameraEvidence(NamedTuple):
 
 
 def camera_evidence(recording: Recording) -> CameraEvidence | None:
-    """What the images say; None without a camera, or where no image has landmarks enough for a pose."""
+    """Measure the agreement of a camera; None without a camera or without an image of six landmarks."""
     camera = recording.camera
     if camera is None:
         return None
-    camera = _middle(camera)
+    camera = _middle_images(camera)
     enough = camera.usable.sum(axis=1) >= pnp.FEWEST
     if not enough.any():
         return None
     some = np.flatnonzero(enough)[:: max(1, -(-int(enough.sum()) // _TRIED))]
     tried = np.isin(np.arange(len(enough)), some)
-    if not pnp.poses(_only(camera, tried)).valid.any():
+    if not pnp.poses(_select_images(camera, tried)).valid.any():
         return CameraEvidence(len(some), 0, np.nan, 0.0, Evidence(), None)
-    usable = _only(camera, enough)
+    usable = _select_images(camera, enough)
     found = pnp.poses(usable)
     posed = found.valid
     error = float(np.median(found.error[posed])) if posed.any() else np.nan
@@ -82,24 +84,24 @@ def camera_evidence(recording: Recording) -> CameraEvidence | None:
     if camera.sigma is not None:
         reported = camera.sigma[camera.usable & np.isfinite(camera.sigma)]
         sigma = float(np.median(reported)) if reported.size else 0.0
-    told, matched, imu = Evidence(), None, recording.imu
+    agreement, matched, imu = Evidence(), None, recording.imu
     if imu is not None and posed.any():
         optical = pnp.as_optical(usable)
-        told = evidence(Recording(recording.name, optical=optical, imu=imu))
+        agreement = evidence(Recording(recording.name, optical=optical, imu=imu))
         try:
             matched = align(optical, imu, recording.path or recording.name)
         except RecordingError:
             matched = None
-    return CameraEvidence(int(enough.sum()), int(posed.sum()), error, sigma, told, matched)
+    return CameraEvidence(int(enough.sum()), int(posed.sum()), error, sigma, agreement, matched)
 
 
-def _only(camera: Camera, images: Flags) -> Camera:
-    """With nothing seen in all other images."""
+def _select_images(camera: Camera, images: Flags) -> Camera:
+    """The camera with all points of the other images hidden."""
     return replace(camera, visible=camera.visible & images[:, None])
 
 
-def _middle(camera: Camera) -> Camera:
-    """Not more images than can be solved for in seconds, without gaps, as turns need neighbours."""
+def _middle_images(camera: Camera) -> Camera:
+    """Consecutive images from the middle of the run, few enough to be solved in seconds."""
     begin = max(0, (len(camera.time_ns) - _MOST_IMAGES) // 2)
     part = slice(begin, begin + _MOST_IMAGES)
     sigma = None if camera.sigma is None else camera.sigma[part]
@@ -113,82 +115,72 @@ def _middle(camera: Camera) -> Camera:
 
 
 def check_camera(recording: Recording, found: CameraEvidence) -> None:
-    """Raise `RecordingError` where images or IMU plainly contradict what is said of the camera: no pose
-    fits any image, or lengths or the gyroscope are in another unit."""
+    """Raise `RecordingError` if the images clearly contradict the description.
+
+    Faults are a camera without any valid pose, and a wrong unit of gyroscope or lengths.
+    """
     if found.posed == 0:
-        raise pnp.no_pose(recording.path or recording.name, found.images)
+        raise pnp.no_pose_error(recording.path or recording.name, found.images)
     imu = found.imu
     unit = rates_unit(imu)
     if unit is not None:
-        raise fault(
-            recording,
-            "imu.unit",
-            f"a gyroscope that turns {imu.rate_ratio:.4g} times as fast as the camera (correlation"
-            f" {imu.rate_correlation:.2f})",
-            "the same rate",
-            f'[imu] unit = "{unit}, m/s^2", the accelerometer\'s as it is',
+        raise rate_fault(
+            recording, imu, "camera", f'"{unit}, m/s^2", the accelerometer\'s as it is'
         )
     check_gravity(recording, imu)
     unit = path_unit(imu)
     if unit is not None:
-        raise fault(
-            recording,
-            "camera.unit",
-            f"a camera that moves {imu.length_ratio:.4g} times as far as the accelerometer (correlation"
-            f" {imu.length_correlation:.2f})",
-            "the same way",
-            f'[camera] unit = "{unit}, px", that of the landmarks\' places',
-        )
+        hint = f'"{unit}, px", that of the landmarks\' positions'
+        raise length_fault(recording, imu, "camera", hint)
 
 
 def camera_warnings(found: CameraEvidence) -> list[str]:
-    """What is not as it should be, though no unit explains it."""
+    """Warnings on a camera that no wrong unit explains."""
     warnings, imu = [], found.imu
     if found.posed < _FEW_FIT * found.images:
         warnings.append(
             f"{found.images - found.posed} of {found.images} images of {pnp.FEWEST} landmarks or"
-            " more fit no pose: look at the landmarks' names and places, and at the lens"
+            " more fit no pose: check the landmarks' names and positions, and the lens"
         )
     if found.error_px > max(_PIXELS, _TIMES * found.sigma_px):
         warnings.append(
-            f"image points lie {found.error_px:.1f} pixels off where the pose of their image puts them: are"
-            " focal, centre and radial those of images of this size, and landmarks where they are said"
-            " to be?"
+            f"the median reprojection error is {found.error_px:.1f} pixels: are focal, centre and radial"
+            " those of images of this size, and the landmarks at their stated positions?"
         )
     alike = imu.rate_correlation > ALIKE
     if alike and abs(imu.rate_ratio - 1.0) > _RATE_OFF:
         warnings.append(
-            f"the gyroscope turns {imu.rate_ratio:.3f} times as fast as the camera: look at the focal"
-            " lengths, and at the gyroscope's scale"
+            f"the gyroscope rotates {imu.rate_ratio:.3f} times as fast as the camera: check the focal"
+            " lengths and the gyroscope's scale"
         )
     if not alike and imu.rate > LEAST_RATE and imu.explained < _EXPLAINED:
         warnings.append(
-            f"the gyroscope explains {100.0 * imu.explained:.0f} % of the camera's turning: are both of"
-            " one run and on one clock, and focal, centre and landmarks as they are said to be?"
+            f"the gyroscope explains {100.0 * imu.explained:.0f} % of the camera's rotation: are both of"
+            " one run and on one clock, and focal, centre and landmarks as stated?"
         )
     if imu.length_correlation > ALIKE and abs(imu.length_ratio - 1.0) > _LENGTH_OFF:
         warnings.append(
             f"the camera moves {imu.length_ratio:.3g} times as far as the accelerometer: are the landmarks'"
-            " places to scale?"
+            " positions to scale?"
         )
     if imu.farthest > FARTHEST_M:
         warnings.append(
-            f"the camera is up to {imu.farthest:.3g} m from the scene's origin: are the landmarks' places"
-            " in metres?"
+            f"the camera is up to {imu.farthest:.3g} m from the scene's origin: are the landmarks'"
+            " positions in metres?"
         )
-    return warnings + ([] if found.match is None else _of_match(found.match))
+    return warnings + ([] if found.match is None else _alignment_warnings(found.match))
 
 
-def _of_match(made: AttitudeMatch) -> list[str]:
+def _alignment_warnings(match: AttitudeMatch) -> list[str]:
     warnings = []
-    if is_late(made):
+    if has_latency(match):
         warnings.append(
-            f"the images are {1e3 * made.latency_s:.1f} ± {1e3 * made.latency_sigma_s:.1f} ms older than"
+            f"the images are {1e3 * match.latency_s:.1f} ± {1e3 * match.latency_sigma_s:.1f} ms older than"
             " stamped, by the IMU's clock: state [camera] latency, or tune calibration.latency"
         )
-    if (turned := turned_deg(made)) is not None:
+    if (misaligned := misalignment_deg(match)) is not None:
         warnings.append(
-            f"the camera is turned by {turned[0]:.1f} ± {turned[1]:.1f} deg against where"
-            " q_body_camera says: correct it, or tune calibration.alignment"
+            f"the camera is rotated by {misaligned[0]:.1f} ± {misaligned[1]:.1f} deg relative to"
+            " the stated q_body_camera: correct it, or tune calibration.alignment"
         )
     return warnings

@@ -1,12 +1,23 @@
-"""What a recorded run holds and whether it can be used as it is: samples, gaps, clocks and units."""
+"""Inspection of a recorded run: samples, gaps, clocks, units, and whether it can be used as it is.
+
+`inspect` gathers the findings for `jaxekf check`; its verdict is ``fine``, ``warnings`` or ``faults``.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support.constants import STANDARD_GRAVITY
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
-from jaxekf.calibration.alignment import RunAlignment, align_run, drifts, is_late, turned_deg
+from jaxekf.calibration.alignment import (
+    RunAlignment,
+    align_run,
+    has_drift,
+    has_latency,
+    misalignment_deg,
+)
 from jaxekf.checks._camera_agreement import (
     CameraEvidence,
     camera_evidence,
@@ -21,46 +32,45 @@ GAP = 1.5
 """Median steps from which on a step is a gap."""
 _LONG_IMU_GAP_S = 0.5
 _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
-_STANDARD = 9.80665
 _SEEN_TOO_LITTLE = 0.5
 _EXPECTED = ("blank", "hidden", "missing tool", "status ")
-"""What begins so is masked in good recordings, too: the tool was hidden."""
+"""Reasons that occur in good recordings, too: the tool was hidden."""
 
 Span = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """Where nothing stands."""
+    """Gaps of a stream."""
 
     count: int
     longest_s: float
     lost_s: float
-    """Sum of the steps over the gaps."""
+    """Total length of the gaps, s."""
     spans: list[Span]
-    """Begin and end, seconds on the recording's clock."""
+    """Begin and end of each gap, s on the recording's clock."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {"count": self.count, "longest_s": self.longest_s, "lost_s": self.lost_s}
 
 
-class StreamFound(NamedTuple):
-    """One stream, or one marker of a tool."""
+class StreamSummary(NamedTuple):
+    """Summary of one stream, or of one marker of a tool."""
 
     samples: int
     usable: int
     rate_hz: float
-    """By the median step; NaN of one sample."""
+    """Rate by the median step, Hz; NaN for one sample."""
     begin_s: float
-    """Seconds on the recording's clock, latency taken off."""
+    """First time, s on the recording's clock, latency subtracted."""
     end_s: float
     gaps: Gaps
-    """Steps of more than 1.5 times the median between the stamps of samples, usable or not."""
+    """Gaps between time stamps, of samples usable or not: steps of more than 1.5 times the median."""
     hidden: Gaps
-    """Stretches of samples that are there and not usable."""
+    """Intervals of samples that exist and are not usable."""
     masked: dict[str, int]
-    """Rows by reason; where none were read, samples that are not valid."""
+    """Masked rows by reason; samples that are not valid if no rows were read."""
     dropped: dict[str, int]
 
     def as_dict(self) -> dict[str, Any]:
@@ -69,37 +79,37 @@ class StreamFound(NamedTuple):
         return document | {"duration_s": self.end_s - self.begin_s}
 
 
-class PointsFound(NamedTuple):
+class PointsSummary(NamedTuple):
     """Landmarks in the images of a camera."""
 
     landmarks: int
     images: int
     points_per_image: float
-    """Usable ones, on average over all images."""
+    """Usable points, mean over all images."""
     images_without_points: int
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found of one run."""
+    """Findings on one run."""
 
     run: str
-    streams: dict[str, StreamFound]
+    streams: dict[str, StreamSummary]
     evidence: Evidence
     alignment: RunAlignment | None
-    """None where the run does not tell it, or has nothing to align."""
+    """None if it could not be estimated, or if there is nothing to align."""
     faults: tuple[str, ...] = ()
-    """What forbids using the run as it is."""
+    """Findings that forbid using the run as it is."""
     warnings: tuple[str, ...] = ()
-    """What should be looked at before."""
+    """Findings to look at before using the run."""
     notes: tuple[str, ...] = ()
-    """What is as it is in good runs, too."""
-    markers: dict[str, StreamFound] = field(default_factory=dict)
-    """Single markers by their names."""
-    points: PointsFound | None = None
+    """Findings that occur in good runs, too."""
+    markers: dict[str, StreamSummary] = field(default_factory=dict)
+    """Single markers by name."""
+    points: PointsSummary | None = None
     """None without a camera."""
     camera: CameraEvidence | None = None
-    """None also where no image has landmarks enough for a pose."""
+    """None without a camera, or if no image has landmarks enough for a pose."""
 
     @property
     def verdict(self) -> str:
@@ -108,7 +118,7 @@ class Inspection:
 
 
 def inspect(recording: Recording) -> Inspection:
-    """Look at a run; nothing that is found raises."""
+    """Inspect a run; a finding is reported and never raises."""
     streams = {label: _stream(recording, label) for label in recording.streams}
     found = evidence(recording)
     faults, warnings, notes = [], [], []
@@ -116,27 +126,27 @@ def inspect(recording: Recording) -> Inspection:
         check(recording, found)
     except RecordingError as error:
         faults.append(str(error))
-    aligned, seen = None, camera_evidence(recording)
-    if seen is not None and not faults:
+    aligned, images = None, camera_evidence(recording)
+    if images is not None and not faults:
         try:
-            check_camera(recording, seen)
+            check_camera(recording, images)
         except RecordingError as error:
             faults.append(str(error))
     tracked = recording.optical is not None or recording.markers is not None
-    if recording.imu is None or not (tracked or seen is not None):
+    if recording.imu is None or not (tracked or images is not None):
         lacking = "IMU" if recording.imu is None else "tracker"
         notes.append(f"without {lacking} neither clocks nor units can be compared")
     elif tracked and not faults:
         try:
             aligned = align_run(recording)
         except RecordingError as error:
-            warnings.append(f"clock and frame are not told: {error}")
+            warnings.append(f"clock and frame could not be estimated: {error}")
     for label in streams:
-        _accounted(recording, label, warnings, notes)
-    warnings += _of_time(streams, found)
-    warnings += [] if aligned is None else _of_clocks(aligned)
-    warnings += [] if faults else _of_units(recording, found)
-    warnings += [] if faults or seen is None else camera_warnings(seen)
+        _add_row_accounts(recording, label, warnings, notes)
+    warnings += _timing_warnings(streams, found)
+    warnings += [] if aligned is None else _clock_warnings(aligned)
+    warnings += [] if faults else _unit_warnings(recording, found)
+    warnings += [] if faults or images is None else camera_warnings(images)
     return Inspection(
         recording.name,
         streams,
@@ -147,11 +157,11 @@ def inspect(recording: Recording) -> Inspection:
         tuple(notes),
         _markers(recording),
         _points(recording),
-        seen,
+        images,
     )
 
 
-def _stream(recording: Recording, label: str) -> StreamFound:
+def _stream(recording: Recording, label: str) -> StreamSummary:
     stream = recording.streams[label]
     usable = stream.seen
     account = recording.intake.get(label)
@@ -161,37 +171,39 @@ def _stream(recording: Recording, label: str) -> StreamFound:
         dropped = {name: reason.count for name, reason in account.dropped.items()}
     elif not usable.all():
         masked = {"not valid": int((~usable).sum())}
-    return _found(stream.time_ns - stream.latency_ns, usable, masked, dropped)
+    return _summary(stream.time_ns - stream.latency_ns, usable, masked, dropped)
 
 
-def _markers(recording: Recording) -> dict[str, StreamFound]:
+def _markers(recording: Recording) -> dict[str, StreamSummary]:
     markers = recording.markers
     if markers is None:
         return {}
     time_ns = markers.time_ns - markers.latency_ns
     return {
-        name: _found(time_ns, markers.usable[:, i], _hidden(markers.usable[:, i]), {})
+        name: _summary(time_ns, markers.usable[:, i], _masked_reason(markers.usable[:, i]), {})
         for i, name in enumerate(markers.names)
     }
 
 
-def _points(recording: Recording) -> PointsFound | None:
+def _points(recording: Recording) -> PointsSummary | None:
     camera = recording.camera
     if camera is None:
         return None
     count = camera.usable.sum(axis=1)
-    return PointsFound(len(camera.names), len(count), float(count.mean()), int((count == 0).sum()))
+    return PointsSummary(
+        len(camera.names), len(count), float(count.mean()), int((count == 0).sum())
+    )
 
 
-def _hidden(usable: Flags) -> dict[str, int]:
+def _masked_reason(usable: Flags) -> dict[str, int]:
     return {} if usable.all() else {"hidden": int((~usable).sum())}
 
 
-def _found(
+def _summary(
     time_ns: Times, usable: Flags, masked: dict[str, int], dropped: dict[str, int]
-) -> StreamFound:
+) -> StreamSummary:
     step = float(np.median(np.diff(time_ns))) / NANOSECONDS if len(time_ns) > 1 else np.nan
-    return StreamFound(
+    return StreamSummary(
         len(time_ns),
         int(usable.sum()),
         1.0 / step if step > 0.0 else np.nan,
@@ -205,7 +217,7 @@ def _found(
 
 
 def find_gaps(time_ns: Times) -> Gaps:
-    """Steps of more than 1.5 times the median."""
+    """Gaps of a stream: steps of more than 1.5 times the median."""
     step = np.diff(time_ns)
     if step.size == 0:
         return Gaps(0, 0.0, 0.0, [])
@@ -214,7 +226,7 @@ def find_gaps(time_ns: Times) -> Gaps:
 
 
 def _stretches(time_ns: Times, bad: Flags) -> Gaps:
-    """Stretches of bad samples, each from its first to the next good one, or to the last."""
+    """Intervals of bad samples, each from its first to the next good one, or to the last."""
     edges = np.flatnonzero(np.diff(np.r_[False, bad, False].astype(int)))
     return _gaps(time_ns, edges[::2], np.minimum(edges[1::2], len(time_ns) - 1))
 
@@ -226,8 +238,10 @@ def _gaps(time_ns: Times, begin: Any, end: Any) -> Gaps:
     return Gaps(len(spans), float(lost.max(initial=0.0)), float(lost.sum()), spans)
 
 
-def _accounted(recording: Recording, label: str, warnings: list[str], notes: list[str]) -> None:
-    """What became of rows, in the words of their account: hidden tools are noted, all else is a warning."""
+def _add_row_accounts(
+    recording: Recording, label: str, warnings: list[str], notes: list[str]
+) -> None:
+    """Add the account of rows: hidden tools become notes, everything else warnings."""
     account = recording.intake.get(label)
     if account is None:
         return
@@ -237,14 +251,14 @@ def _accounted(recording: Recording, label: str, warnings: list[str], notes: lis
         (notes if name.startswith(_EXPECTED) else warnings).append(text)
 
 
-def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
+def _timing_warnings(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
     warnings = []
     imu = streams.get("imu")
     long = [b - a for a, b in imu.gaps.spans if b - a > _LONG_IMU_GAP_S] if imu else []
     if long:
         warnings.append(
             f"the IMU has {len(long)} gaps of more than {_LONG_IMU_GAP_S:g} s, the longest of"
-            f" {max(long):.2f} s: what is estimated within is made up"
+            f" {max(long):.2f} s: estimates within a gap are not usable"
         )
     for label, name in (("optical", "tracker"), ("markers", "tracker"), ("camera", "camera")):
         seeing = streams.get(label)
@@ -262,35 +276,40 @@ def _of_time(streams: dict[str, StreamFound], found: Evidence) -> list[str]:
     return warnings
 
 
-def _of_clocks(aligned: RunAlignment) -> list[str]:
-    made = aligned.tracker
+def _clock_warnings(aligned: RunAlignment) -> list[str]:
+    match = aligned.tracker
     warnings = list(aligned.notes)
-    if is_late(made) and not drifts(made):
+    if has_latency(match) and not has_drift(match):
         warnings.append(
-            f"the tracker's samples are {1e3 * made.latency_s:.1f} ms older than stamped, by the IMU's"
-            " clock: jaxekf align writes a calibration that makes it good"
+            f"the tracker's samples are {1e3 * match.latency_s:.1f} ms older than stamped, by the IMU's"
+            " clock: jaxekf align writes a calibration that corrects it"
         )
-    if (turned := turned_deg(made)) is not None:
+    if (misaligned := misalignment_deg(match)) is not None:
         warnings.append(
-            f"the tracked frame is turned by {turned[0]:.1f} deg against the IMU's: jaxekf align"
-            " writes a calibration that makes it good"
+            f"the tool frame is rotated by {misaligned[0]:.1f} deg relative to the IMU's: jaxekf align"
+            " writes a calibration that corrects it"
         )
     return warnings
 
 
-def _of_units(recording: Recording, found: Evidence) -> list[str]:
-    """Numbers that no unit explains, and are not what they should be."""
+def _unit_warnings(recording: Recording, found: Evidence) -> list[str]:
+    """Warnings on implausible values that no wrong unit explains."""
     warnings = []
-    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [_STANDARD])))
+    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     at_rest = found.static_scatter < _GRAVITY_OFF
     if at_rest and abs(found.static_norm / max(gravity, 1e-9) - 1.0) > _GRAVITY_OFF:
         warnings.append(
-            f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest, where gravity is {gravity:.2f}"
+            f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest; gravity is {gravity:.2f}"
         )
     if abs(found.rate_ratio - 1.0) > _RATE_OFF:
-        warnings.append(f"the gyroscope turns {found.rate_ratio:.3f} times as fast as the tracker")
+        warnings.append(
+            f"the gyroscope rotates {found.rate_ratio:.3f} times as fast as the tracker"
+        )
     if found.farthest > FARTHEST_M:
         warnings.append(
             f"the tool is up to {found.farthest:.3g} m from the reference's origin: are these metres?"
         )
     return warnings
+
+
+__getattr__ = renamed(__name__, "PointsFound>PointsSummary StreamSummary>StreamSummary")

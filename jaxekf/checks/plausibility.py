@@ -1,12 +1,14 @@
-"""Whether a recording's numbers are what its description says: units, order of the quaternion, overlap.
+"""Plausibility of a recording's description: units, quaternion order, gravity, overlap in time.
 
-Only what the streams contradict plainly is an error; what they do not tell is NaN and passes.
+`require` raises if the streams clearly contradict the description. A quantity that the streams do not
+determine is NaN and passes.
 """
 
 from typing import Any
 
 import numpy as np
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks.sensor_agreement import (
     ALIKE,
@@ -24,49 +26,44 @@ __all__ = ["Evidence", "check", "evidence", "require"]
 
 THOUSAND = 1000.0
 _CLOSE = 0.15
-"""Share by which a ratio may miss that of a unit."""
+"""Relative error of a rate ratio that is still taken for a unit factor."""
 _NEAR = 0.35
-"""The same of lengths, whose ratio a lever arm changes."""
+"""The same for lengths, whose ratio a lever arm changes."""
 _POOR, _BETTER = 0.95, 4.0
-"""Share of turning that a wrong reading does not explain, and by how much less a right one leaves: noise
-leaves the same in every reading, so that a factor is no chance."""
+"""Explained share below which a reading of the quaternion is wrong, and the factor by which the right
+reading reduces the unexplained rest. Noise leaves the same rest in every reading, so the factor is
+significant."""
 _TWO_AXES = 0.05
 LEAST_RATE = np.deg2rad(2.0)
-"""rad/s: of slower turning noise decides how alike it is."""
+"""rad/s: at slower rotation noise dominates the correlation."""
 _LEAST_ACCELERATION = 0.1
 _NEARBY, FARTHEST_M = 0.02, 20.0
-"""Metres: no tracker has its tool always as near as the first, or as far as the second."""
-_STANDARD = 9.80665
+"""Metres: a tracker's tool is never always as near as the first, nor as far as the second."""
 _G_WITHIN, _REMOVED_BELOW = 0.15, 0.5
 _STEADY = 0.15
 _SIZE_OFF, _TURNED = 0.5, np.deg2rad(30.0)
 
 
 def require(recording: Recording) -> None:
-    """Raise `RecordingError` where the streams plainly contradict what is said of them.
+    """Raise `RecordingError` if the streams clearly contradict the description.
 
-    Faults are streams that do not overlap, gyroscope, accelerometer or lengths in another unit than
-    stated, gravity removed, and a quaternion in another order or of the other direction.
+    Faults are streams that do not overlap, a wrong unit of gyroscope, accelerometer or lengths, removed
+    gravity, and a quaternion of another component order or direction.
     """
     check(recording, evidence(recording))
 
 
 def check(recording: Recording, found: Evidence) -> None:
-    """As `require`, with the evidence at hand."""
+    """The same as `require`, for evidence that is already measured."""
     for label in (tracker_label(recording), "camera"):
         if overlap_s(found.ranges_s, label) < 0.0:
-            raise _apart(recording, found, label)
+            raise _no_overlap(recording, found, label)
     _check_truth(recording)
-    force = _force(recording, found)
+    force = _force_unit(recording, found)
     rate = rates_unit(found)
     if rate is not None:
-        raise fault(
-            recording,
-            "imu.unit",
-            f"a gyroscope that turns {found.rate_ratio:.4g} times as fast as the tracker (correlation"
-            f" {found.rate_correlation:.2f})",
-            "the same rate",
-            f'[imu] unit = "{rate}, {"m/s^2" if force is None else force[0]}"',
+        raise rate_fault(
+            recording, found, "tracker", f'"{rate}, {"m/s^2" if force is None else force[0]}"'
         )
     if force is not None:
         raise force[1]
@@ -76,15 +73,30 @@ def check(recording: Recording, found: Evidence) -> None:
 
 
 def rates_unit(found: Evidence) -> str | None:
-    """The gyroscope's unit to state instead; None where turning does not tell that another is meant."""
+    """The unit to state for the gyroscope; None if the stated one is plausible."""
     if not (found.rate > LEAST_RATE and found.rate_correlation > ALIKE):
         return None
     return _unit(found.rate_ratio, DEGREES, _CLOSE, ("deg/s", "rad/s"))
 
 
+def rate_fault(recording: Recording, found: Evidence, reference: str, unit: str) -> RecordingError:
+    """The error about the gyroscope's unit: the rate of `reference` is another one."""
+    got = f"a gyroscope that rotates {found.rate_ratio:.4g} times as fast as the {reference}"
+    correlation = f" (correlation {found.rate_correlation:.2f})"
+    return fault(recording, "imu.unit", got + correlation, "the same rate", f"[imu] unit = {unit}")
+
+
+def length_fault(recording: Recording, found: Evidence, stream: str, unit: str) -> RecordingError:
+    """The error about the unit of positions of the stream ``optical`` or ``camera``."""
+    name = "tracker" if stream == "optical" else stream
+    got = f"a {name} that moves {found.length_ratio:.4g} times as far as the accelerometer"
+    correlation = f" (correlation {found.length_correlation:.2f})"
+    hint = f"[{stream}] unit = {unit}"
+    return fault(recording, f"{stream}.unit", got + correlation, "the same distance", hint)
+
+
 def path_unit(found: Evidence) -> str | None:
-    """The unit of positions to state instead; None where the accelerometer does not tell that another is
-    meant."""
+    """The unit to state for positions; None if the stated one is plausible."""
     if not found.length_correlation > ALIKE:
         return None
     unit = _unit(found.length_ratio, THOUSAND, _NEAR, ("mm", "m"))
@@ -98,31 +110,35 @@ def path_unit(found: Evidence) -> str | None:
 
 
 def _unit(ratio: float, factor: float, within: float, names: tuple[str, str]) -> str | None:
-    """The unit to state instead, of numbers a factor too large or too small; None where neither."""
+    """The unit to state for numbers that are a factor too large or too small; None if neither."""
     for size, name in ((ratio / factor, names[0]), (ratio * factor, names[1])):
         if 1.0 / (1.0 + within) <= size <= 1.0 + within:
             return name
     return None
 
 
-def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] | None:
-    """The accelerometer's unit to state instead, and the fault."""
-    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [_STANDARD])))
+def _force_unit(recording: Recording, found: Evidence) -> tuple[str, RecordingError] | None:
+    """The unit to state for the accelerometer, and the error; None if the stated one is plausible."""
+    gravity = float(np.linalg.norm(recording.info.get("gravity_ref", [STANDARD_GRAVITY])))
     norm = found.static_norm
-    if not np.isfinite(norm) or not 0.5 < gravity / _STANDARD < 2.0:
+    if not np.isfinite(norm) or not 0.5 < gravity / STANDARD_GRAVITY < 2.0:
         return None
     got = f"an accelerometer that reads {norm:.3g} m/s^2 when quietest"
     expected = f"about {gravity:.3g} m/s^2"
     if norm >= _REMOVED_BELOW and found.static_scatter > _STEADY:
-        # Never at rest: what is left besides motion is told by the tracker's attitudes.
+        # Never at rest: the mean in the tracker's frame is free of motion.
         far = norm < 0.2 * gravity or norm > 3.0 * gravity
         norm = found.mean_force if far else np.nan
         got = f"an accelerometer whose readings average {norm:.2g} m/s^2 in the tracker's frame"
     if norm < _REMOVED_BELOW:
         hint = "recording with gravity in it, or leaving out the columns ax, ay, az"
-        error = fault(recording, "imu.unit", got, f"{expected}: gravity is removed", hint)
+        error = fault(recording, "imu.unit", got, f"{expected}; gravity is removed", hint)
         return "m/s^2", error
-    for unit, size in (("g", 1.0), ("m/s^2", _STANDARD**2), ("mm/s^2", 1e3 * _STANDARD)):
+    for unit, size in (
+        ("g", 1.0),
+        ("m/s^2", STANDARD_GRAVITY**2),
+        ("mm/s^2", 1e3 * STANDARD_GRAVITY),
+    ):
         if abs(norm / size - 1.0) < _G_WITHIN:
             hint = f'[imu] unit = "rad/s, {unit}"'
             return unit, fault(recording, "imu.unit", got, expected, hint)
@@ -130,26 +146,25 @@ def _force(recording: Recording, found: Evidence) -> tuple[str, RecordingError] 
 
 
 def check_gravity(recording: Recording, found: Evidence) -> None:
-    """Raise `RecordingError` where the accelerometer contradicts the `gravity_ref` that a run states: it is
-    of another size, the other way round, or along another axis."""
+    """Raise `RecordingError` if the accelerometer contradicts size or direction of `gravity_ref`."""
     stated = recording.info.get("gravity_ref")
     if stated is None:
         return
     size, norm = float(np.linalg.norm(stated)), found.static_norm
-    plain = found.static_scatter < _STEADY and 0.5 < norm / _STANDARD < 2.0
+    plain = found.static_scatter < _STEADY and 0.5 < norm / STANDARD_GRAVITY < 2.0
     if plain and abs(norm / max(size, 1e-12) - 1.0) > _SIZE_OFF:
-        got, expected = f"free fall of {size:.3g} m/s^2", f"about {norm:.3g}, as at rest"
+        got, expected = f"gravity of {size:.3g} m/s^2", f"about {norm:.3g}, as measured at rest"
     elif (
         found.second_axis > _TWO_AXES and abs(found.mean_force / max(size, 1e-12) - 1.0) < _SIZE_OFF
     ):
-        # Turns about one axis leave open how the IMU's frame lies about it.
+        # Rotation about one axis only leaves the IMU's orientation about it undetermined.
         fall = -np.asarray(found.mean_force_ref)
         angle = np.arccos(np.clip(fall @ np.asarray(stated) / (found.mean_force * size), -1.0, 1.0))
         if angle < _TURNED:
             return
         near = f"[{', '.join(f'{value:.1f}' for value in fall)}]"
-        got = f"free fall that is {np.rad2deg(angle):.0f} deg off what the accelerometer says"
-        expected = f"about {near} m/s^2 in the reference frame (what falls accelerates downwards)"
+        got = f"a gravity vector {np.rad2deg(angle):.0f} deg off the accelerometer's"
+        expected = f"about {near} m/s^2 in the reference frame (gravity points down)"
     else:
         return
     also = ", or the direction of the quaternions" if recording.optical is not None else ""
@@ -157,66 +172,51 @@ def check_gravity(recording: Recording, found: Evidence) -> None:
 
 
 def _check_length(recording: Recording, found: Evidence) -> None:
-    """Millimetres taken for metres, or the other way round."""
+    """Raise `RecordingError` if millimetres are taken for metres or the reverse."""
     if recording.optical is None:
         unit = _unit(found.length_ratio, THOUSAND, _NEAR, ("mm", "m"))
         if unit is None:
             return
         stated = recording.info.get("markers_about", {}).get("unit", "m")
-        hint = f'[markers] unit = "{unit}"'
-        if stated == unit:
-            hint = "[markers.geometry] in metres"
-        raise fault(
-            recording,
-            "markers.unit",
-            f"markers {found.length_ratio:.4g} times as far apart as in the geometry",
-            "the same distances",
-            hint,
-        )
+        hint = "[markers.geometry] in metres" if stated == unit else f'[markers] unit = "{unit}"'
+        got = f"markers {found.length_ratio:.4g} times as far apart as in the geometry"
+        raise fault(recording, "markers.unit", got, "the same distances", hint)
     unit = path_unit(found)
-    if unit is None:
-        return
-    raise fault(
-        recording,
-        "optical.unit",
-        f"a tracker that moves {found.length_ratio:.4g} times as far as the accelerometer (correlation"
-        f" {found.length_correlation:.2f})",
-        "the same way",
-        f'[optical] unit = "1, {unit}"',
-    )
+    if unit is not None:
+        raise length_fault(recording, found, "optical", f'"1, {unit}"')
 
 
 def _check_order(recording: Recording, found: Evidence) -> None:
-    """A quaternion whose order, or whose direction, is not as stated."""
+    """Raise `RecordingError` if the quaternion's component order or direction is not as stated."""
     left = 1.0 - found.explained
     fits = {
-        name: made
-        for name, made in found.readings.items()
-        if made.share > EXPLAINED and left > _BETTER * (1.0 - made.share)
+        name: fit
+        for name, fit in found.readings.items()
+        if fit.explained > EXPLAINED and left > _BETTER * (1.0 - fit.explained)
     }
     enough = found.second_axis > _TWO_AXES and found.rate > LEAST_RATE
     if not fits or not enough or not found.explained < _POOR:
         return
-    # By turns alone the one is the other with the frames aligned otherwise: the smaller turn between the
-    # IMU's axes and the tool's is what was built.
+    # Rotations alone cannot distinguish some readings, which differ by a rotation of the frames: the one
+    # with the smaller rotation between IMU and tool is the more likely mounting.
     names = sorted(fits, key=lambda name: fits[name].angle)
     entries = " or ".join(f'quaternion = "{name}"' for name in names)
     also = ""
     if len(names) > 1:
         angles = " and ".join(f"{np.rad2deg(fits[name].angle):.0f}" for name in names)
-        also = f", which turn the IMU's axes by {angles} deg against the tool's"
+        also = f", which rotate the IMU's axes by {angles} deg relative to the tool's"
     about = recording.info.get("optical_about", {}).get("quaternion", BODY_TO_REFERENCE)
     raise fault(
         recording,
         "optical.quaternion",
         f"quaternions of which, as '{about}', the gyroscope explains"
-        f" {100.0 * found.explained:.0f} % of the turning",
-        f"more; read otherwise it explains {100.0 * fits[names[0]].share:.0f} %",
+        f" {100.0 * found.explained:.0f} % of the rotation",
+        f"more; in another reading it explains {100.0 * fits[names[0]].explained:.0f} %",
         f"[optical] {entries}{also}; where a header names the columns, naming them as they are",
     )
 
 
-def _apart(recording: Recording, found: Evidence, label: str) -> RecordingError:
+def _no_overlap(recording: Recording, found: Evidence, label: str) -> RecordingError:
     words = [
         f"{name} from {_seconds(found.ranges_s[name][0])} to {_seconds(found.ranges_s[name][1])} s"
         for name in (label, "imu")
@@ -230,7 +230,7 @@ def _apart(recording: Recording, found: Evidence, label: str) -> RecordingError:
 
 
 def _check_truth(recording: Recording) -> None:
-    """Truth of another time than what it is the truth of."""
+    """Raise `RecordingError` if the ground truth does not overlap the other streams."""
     truth = recording.encoder
     streams = (recording.optical, recording.markers, recording.camera, recording.imu)
     others = [stream for stream in streams if stream is not None]
@@ -255,7 +255,7 @@ def _seconds(value: float) -> str:
 
 
 def fault(recording: Recording, entry: str, got: str, expected: str, hint: str) -> RecordingError:
-    """A fault of what `recording.toml` says, or of a run that has none."""
+    """An error about an entry of `recording.toml`, or about a run without one."""
     place: Any = recording.path or recording.name
     column = None
     if recording.path is not None and (recording.path / FILE).is_file():

@@ -1,6 +1,7 @@
-"""What tracker and IMU of a recording say of its units, the order of its quaternion and its time.
+"""Agreement of tracker and IMU of a recording: units, quaternion order, time.
 
-Measured, not judged: `plausible` judges. What the streams do not tell is NaN.
+`evidence` measures and does not judge; `plausibility` judges. A quantity that the streams do not determine
+is NaN.
 """
 
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf.calibration import motion_agreement
-from jaxekf.calibration.motion_agreement import Fit, Turns
+from jaxekf.calibration.motion_agreement import MotionFit, RelativeRotations
 from jaxekf.pose_solvers.marker_pose import from_markers
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.facts import BODY_TO_REFERENCE
@@ -25,9 +26,9 @@ from jaxekf.recordings.types import (
 )
 
 ALIKE = 0.8
-"""Correlation from which on a ratio is that of one motion."""
+"""Correlation from which on both streams measure the same motion, so that their ratio is meaningful."""
 EXPLAINED = 0.9
-"""Share of the turning that a right reading explains."""
+"""Share of the rotation that the right reading of a quaternion explains."""
 DEGREES = 180.0 / np.pi
 _WINDOWS, _QUIETEST = 200, 5
 _MARKER_PAIRS = 1500
@@ -37,42 +38,43 @@ _ORDERS = {"w,x,y,z": "x,y,z,w", "x,y,z,w": "w,x,y,z"}
 
 @dataclass(frozen=True)
 class Evidence:
-    """What was measured of a recording; NaN for what it does not tell."""
+    """Measurements on a recording; NaN if the streams do not determine a quantity."""
 
     turns: int = 0
-    """Turns of the tracker that were compared with the gyroscope."""
+    """Relative rotations of the tracker that were compared with the gyroscope."""
     rate: float = np.nan
     """Root mean square rate of the tracker, rad/s."""
     second_axis: float = np.nan
-    """Turning about a second axis beside the first, by the gyroscope, in squares: 0 to 1."""
+    """Squared rotation about the second principal axis over that about the first, by the gyroscope: 0 to
+    1."""
     lag_s: float = np.nan
-    """At which both turn alike fast, to 5 ms; `alignment` tells it well."""
+    """Lag of the tracker to 5 ms, s; `jaxekf.calibration.alignment` estimates it precisely."""
     rate_ratio: float = np.nan
-    """The gyroscope's rate to the tracker's: 1, or 57.3 where deg/s were taken for rad/s."""
+    """Gyroscope's rate over tracker's rate: 1, or 57.3 if deg/s were taken for rad/s."""
     rate_correlation: float = np.nan
-    """Of the turns as vectors, in the order and direction of the quaternion that fits best."""
+    """Correlation of the rotation vectors, for the best reading of the quaternion."""
     explained: float = np.nan
-    """Share of the tracker's turning that the gyroscope explains, frames aligned."""
-    readings: dict[str, Fit] = field(default_factory=dict)
-    """The same were the quaternion in another order, or of the other direction."""
+    """Share of the tracker's squared rotation that the gyroscope explains, frames aligned."""
+    readings: dict[str, MotionFit] = field(default_factory=dict)
+    """The same for other readings of the quaternion (component order or direction)."""
     static_norm: float = np.nan
-    """The accelerometer's in the quietest seconds, m/s^2."""
+    """Norm of the specific force in the quietest seconds, m/s^2."""
     static_scatter: float = np.nan
-    """Deviation of that norm over it."""
+    """Relative standard deviation of that norm."""
     mean_force_ref: tuple[float, ...] = (np.nan, np.nan, np.nan)
-    """Mean of the accelerometer's readings in the reference frame, m/s^2, of any motion."""
+    """Mean specific force in the reference frame, m/s^2, valid for any motion."""
     length_ratio: float = np.nan
-    """The tracker's acceleration to the accelerometer's, or the markers' distances to the geometry's."""
+    """Tracker's acceleration over the accelerometer's, or markers' distances over the geometry's."""
     length_correlation: float = np.nan
-    """1 for markers."""
+    """Correlation of the accelerations; 1 for markers."""
     acceleration: float = np.nan
-    """Root mean square of the tracker's over 0.2 s, m/s^2."""
+    """Root mean square of the tracker's acceleration over 0.2 s, m/s^2."""
     farthest: float = np.nan
-    """Distance of the tool from the reference's origin that 95 % of poses stay within, m."""
+    """95 % quantile of the tool's distance from the reference frame's origin, m."""
     ranges_s: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """First and last time of each stream, latency taken off, s."""
+    """First and last time of each stream, latency subtracted, s."""
     overlap_s: float = np.nan
-    """Of tracker and IMU; negative where one ends before the other begins."""
+    """Overlap of tracker and IMU, s; negative if one ends before the other begins."""
 
     @property
     def mean_force(self) -> float:
@@ -81,7 +83,7 @@ class Evidence:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; angles in degrees."""
-        told = {name: found.share for name, found in self.readings.items()}
+        measured = {name: found.explained for name, found in self.readings.items()}
         return {
             "turns": self.turns,
             "rate_deg_s": self.rate * DEGREES,
@@ -90,7 +92,7 @@ class Evidence:
             "rate_ratio": self.rate_ratio,
             "rate_correlation": self.rate_correlation,
             "explained": self.explained,
-            "explained_otherwise": told,
+            "explained_otherwise": measured,
             "static_norm": self.static_norm,
             "mean_force": self.mean_force,
             "mean_force_ref": list(self.mean_force_ref),
@@ -102,46 +104,48 @@ class Evidence:
 
 
 def evidence(recording: Recording) -> Evidence:
-    """What tracker and IMU of a run say of units, order and time; quick, for a run of any length."""
+    """Measure the agreement of tracker and IMU; fast for a run of any length."""
     tracker, imu = recording.optical or recording.markers, recording.imu
-    told: dict[str, Any] = {"ranges_s": _ranges(recording)}
+    measured: dict[str, Any] = {"ranges_s": _ranges(recording)}
     if imu is not None:
-        told["static_norm"], told["static_scatter"] = static_norm(imu)
+        measured["static_norm"], measured["static_scatter"] = static_norm(imu)
     if isinstance(tracker, Markers):
-        told["length_ratio"] = marker_ratio(tracker)
-        told["length_correlation"] = 1.0 if np.isfinite(told["length_ratio"]) else np.nan
+        measured["length_ratio"] = marker_ratio(tracker)
+        measured["length_correlation"] = 1.0 if np.isfinite(measured["length_ratio"]) else np.nan
     if tracker is None or imu is None:
-        return Evidence(**told)
-    told["overlap_s"] = overlap_s(told["ranges_s"], tracker_label(recording))
+        return Evidence(**measured)
+    measured["overlap_s"] = overlap_s(measured["ranges_s"], tracker_label(recording))
     if isinstance(tracker, Optical):
         rows = np.flatnonzero(tracker.valid)
         valid = tracker.valid.copy()
-        valid[rows[motion_agreement.strays(tracker.q_ref_body[rows])]] = False
+        valid[rows[motion_agreement.outlying_poses(tracker.q_ref_body[rows])]] = False
         tracker = replace(tracker, valid=valid)
-    made = _turns(tracker, imu)
-    if made is None:
-        return Evidence(**told)
-    stated, others = motion_agreement.fit(made.tracker, made.gyroscope), {}
+    rotations = _rotations(tracker, imu)
+    if rotations is None:
+        return Evidence(**measured)
+    stated, others = motion_agreement.fit(rotations.tracker, rotations.gyroscope), {}
     if isinstance(tracker, Optical):
-        others = motion_agreement.readings(made, _other_readings(recording))
-    best = max([stated, *others.values()], key=lambda found: found.share)
-    told |= {
-        "turns": len(made.span),
-        "rate": float(np.sqrt(np.mean(np.sum(made.tracker**2, axis=1) / made.span**2))),
-        "second_axis": motion_agreement.second_axis(made.gyroscope),
-        "lag_s": made.lag_s,
-        "rate_ratio": best.ratio if np.sqrt(best.share) > ALIKE else np.nan,
-        "rate_correlation": float(np.sqrt(best.share)),
-        "explained": stated.share,
+        others = motion_agreement.fit_readings(rotations, _other_readings(recording))
+    best = max([stated, *others.values()], key=lambda found: found.explained)
+    measured |= {
+        "turns": len(rotations.duration_s),
+        "rate": float(
+            np.sqrt(np.mean(np.sum(rotations.tracker**2, axis=1) / rotations.duration_s**2))
+        ),
+        "second_axis": motion_agreement.second_axis_share(rotations.gyroscope),
+        "lag_s": rotations.lag_s,
+        "rate_ratio": best.rate_ratio if np.sqrt(best.explained) > ALIKE else np.nan,
+        "rate_correlation": float(np.sqrt(best.explained)),
+        "explained": stated.explained,
         "readings": others,
     }
-    if stated.share > EXPLAINED:
-        told["mean_force_ref"] = tuple(
-            motion_agreement.mean_force(made, imu, stated.frame).tolist()
+    if stated.explained > EXPLAINED:
+        measured["mean_force_ref"] = tuple(
+            motion_agreement.mean_force(rotations, imu, stated.frame).tolist()
         )
     if isinstance(tracker, Optical):
-        told |= _lengths(tracker, imu, made, stated)
-    return Evidence(**told)
+        measured |= _lengths(tracker, imu, rotations, stated)
+    return Evidence(**measured)
 
 
 def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
@@ -153,8 +157,10 @@ def _ranges(recording: Recording) -> dict[str, tuple[float, float]]:
 
 
 def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
-    """How long a stream and the IMU overlap; negative where one ends before the other begins, NaN where one
-    is not there."""
+    """Overlap of a stream and the IMU, s.
+
+    Negative if one ends before the other begins, NaN if one is missing.
+    """
     if label not in ranges_s or "imu" not in ranges_s:
         return np.nan
     one, other = ranges_s["imu"], ranges_s[label]
@@ -162,30 +168,32 @@ def overlap_s(ranges_s: Mapping[str, tuple[float, float]], label: str) -> float:
 
 
 def tracker_label(recording: Recording) -> str:
-    """Which stream the tracker is."""
+    """Name of the tracker's stream."""
     return "optical" if recording.optical is not None else "markers"
 
 
-def _turns(tracker: Optical | Markers, imu: Imu) -> Turns | None:
+def _rotations(tracker: Optical | Markers, imu: Imu) -> RelativeRotations | None:
     if isinstance(tracker, Optical):
         rows = np.flatnonzero(tracker.valid)
-        t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
-        return motion_agreement.turns(t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu)
+        t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
+        return motion_agreement.relative_rotations(
+            t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu
+        )
     rows = np.flatnonzero(tracker.usable.sum(axis=1) >= 3)
-    t = _since(tracker.time_ns[rows] - tracker.latency_ns, imu)
+    t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
 
     def attitude(chosen: Indices) -> Floats:
-        return from_markers(some_frames(tracker, rows[chosen])).q_ref_body
+        return from_markers(select_frames(tracker, rows[chosen])).q_ref_body
 
-    return motion_agreement.turns(t, attitude, imu, _MARKER_PAIRS)
+    return motion_agreement.relative_rotations(t, attitude, imu, _MARKER_PAIRS)
 
 
-def _since(time_ns: Times, imu: Imu) -> Floats:
+def _seconds_since_imu_start(time_ns: Times, imu: Imu) -> Floats:
     return (time_ns - imu.time_ns[0]) / NANOSECONDS
 
 
-def some_frames(markers: Markers, rows: Indices) -> Markers:
-    """Some frames of single markers, what is not usable hidden."""
+def select_frames(markers: Markers, rows: Indices) -> Markers:
+    """Some frames of single markers, unusable markers hidden."""
     return Markers(
         markers.time_ns[rows],
         markers.position[rows],
@@ -195,18 +203,20 @@ def some_frames(markers: Markers, rows: Indices) -> Markers:
     )
 
 
-def _other_readings(recording: Recording) -> dict[str, motion_agreement.Reading]:
-    """What the quaternion may be instead, by the entry of `recording.toml` that would say so."""
+def _other_readings(recording: Recording) -> dict[str, motion_agreement.QuaternionReading]:
+    """Other readings of the quaternion, by the entry of `recording.toml` that would state them."""
     about = recording.info.get("optical_about", {})
-    said = [part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")]
-    order = ",".join([part for part in said if len(part) == 1] or "wxyz")
-    direction = next((part for part in said if len(part) > 1), "body to reference")
-    turned = "reference to body" if direction == "body to reference" else "body to reference"
-    found: dict[str, motion_agreement.Reading] = {
-        f"{order}, {turned}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
+    stated_parts = [
+        part.strip() for part in str(about.get("quaternion", BODY_TO_REFERENCE)).split(",")
+    ]
+    order = ",".join([part for part in stated_parts if len(part) == 1] or "wxyz")
+    direction = next((part for part in stated_parts if len(part) > 1), "body to reference")
+    opposite = "reference to body" if direction == "body to reference" else "body to reference"
+    found: dict[str, motion_agreement.QuaternionReading] = {
+        f"{order}, {opposite}": lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])
     }
     if order in _ORDERS:
-        # What was stated scalar first is scalar last: its numbers moved on by one; or the other way round.
+        # Stated scalar first, actually scalar last: the components are shifted by one; or the reverse.
         shift = 1 if order == "w,x,y,z" else -1
         sign = np.array([1.0, -1.0, -1.0, -1.0]) if direction == "reference to body" else 1.0
         found[f"{_ORDERS[order]}, {direction}"] = lambda q: np.roll(q * sign, shift, axis=1) * sign
@@ -214,8 +224,7 @@ def _other_readings(recording: Recording) -> dict[str, motion_agreement.Reading]
 
 
 def static_norm(imu: Imu) -> tuple[float, float]:
-    """Median norm of the accelerometer's readings, m/s^2, in the seconds in which they scatter least, and
-    that norm's deviation over it."""
+    """Median norm of the specific force in the quietest seconds, m/s^2, and its relative deviation."""
     if imu.accelerometer is None or len(imu.time_ns) < 2:
         return np.nan, np.nan
     span = (imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
@@ -231,7 +240,7 @@ def static_norm(imu: Imu) -> tuple[float, float]:
 
 
 def marker_ratio(markers: Markers) -> float:
-    """Median ratio of the distances between markers seen together to those of the geometry."""
+    """Median ratio of the markers' measured distances to those of the geometry."""
     rows = np.arange(0, len(markers.time_ns), max(1, -(-len(markers.time_ns) // _FRAMES)))
     usable, position = markers.usable[rows], markers.position[rows]
     ratios = []
@@ -245,8 +254,10 @@ def marker_ratio(markers: Markers) -> float:
     return float(np.median(np.concatenate(ratios))) if ratios else np.nan
 
 
-def _lengths(tracker: Optical, imu: Imu, made: Turns, stated: Fit) -> dict[str, float]:
-    found = motion_agreement.distance(tracker, imu, made.lag_s, stated.frame)
+def _lengths(
+    tracker: Optical, imu: Imu, rotations: RelativeRotations, stated: MotionFit
+) -> dict[str, float]:
+    found = motion_agreement.acceleration_fit(tracker, imu, rotations.lag_s, stated.frame)
     if found is None or tracker.position is None:
         return {}
     far = np.linalg.norm(tracker.position[tracker.valid], axis=1)

@@ -8,11 +8,11 @@ import numpy as np
 from msgspec import UNSET, Struct
 
 from jaxekf.calibration.alignment import (
+    CombinedAlignment,
     RunAlignment,
-    Together,
     align_run,
     calibration_for,
-    together,
+    combine_runs,
 )
 from jaxekf.calibration.attitude_alignment import AttitudeMatch
 from jaxekf.cli.console import (
@@ -58,7 +58,7 @@ def align(
     chosen = get_model(model)
     recordings = load_runs(runs, sort=sort)
     found = [align_run(recording) for recording in recordings]
-    mean = together(found)
+    mean = combine_runs(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:
         for text in run.notes:
@@ -85,7 +85,7 @@ def align(
     _print(found, mean)
 
 
-def _print(found: list[RunAlignment], mean: Together) -> None:
+def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:
     rows = []
     for run in found:
         rows.append(aligned_row(run.run, "tracker", run.tracker))
@@ -166,7 +166,7 @@ def match_document(made: AttitudeMatch) -> documents.StreamAlignment:
     )
 
 
-def _shared(made: AttitudeMatch | Together, kind: type[Struct]) -> dict[str, Any]:
+def _shared(made: AttitudeMatch | CombinedAlignment, kind: type[Struct]) -> dict[str, Any]:
     """The fields of a document that have the same name in both, and the alignment in degrees."""
     found = {
         name: value for name, value in made._asdict().items() if name in kind.__struct_fields__

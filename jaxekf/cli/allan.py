@@ -7,7 +7,7 @@ import click
 import numpy as np
 
 from jaxekf.calibration.allan import SensorNoise
-from jaxekf.calibration.noise_densities import Estimated
+from jaxekf.calibration.noise_densities import Coefficient
 from jaxekf.calibration.static_interval import TrackerNoise
 from jaxekf.calibration.static_noise import (
     AXES,
@@ -125,11 +125,13 @@ def _print_sensor(label: str, sensor: SensorNoise) -> None:
     print_table(f"{label.capitalize()} at rest", columns, rows)
 
 
-def _with_interval(made: Estimated, turn: float) -> tuple[str, str]:
+def _with_interval(made: Coefficient, turn: float) -> tuple[str, str]:
     """A coefficient and its interval; where it is not told from nothing, the limit alone."""
     low, high = (f"{turn * value:.3g}" for value in (made.low, made.high))
     return (
-        (f"{turn * made.value:.3g}", f"{low} to {high}") if made.found else ("–", f"below {high}")
+        (f"{turn * made.value:.3g}", f"{low} to {high}")
+        if made.significant
+        else ("–", f"below {high}")
     )
 
 

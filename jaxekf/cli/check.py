@@ -9,7 +9,7 @@ import click
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.checks.inspection import Inspection, StreamFound, inspect
+from jaxekf.checks.inspection import Inspection, StreamSummary, inspect
 from jaxekf.checks.sensor_agreement import Evidence
 from jaxekf.cli.align import aligned_row, alignment_columns, match_document, run_document
 from jaxekf.cli.console import (
@@ -164,7 +164,7 @@ def _print_run(one: Checked, *, tables: bool) -> None:
     click.echo(f"{found.run}: {words[found.verdict]}\n")
 
 
-def _row(label: str, stream: StreamFound) -> list[Any]:
+def _row(label: str, stream: StreamSummary) -> list[Any]:
     return [
         label,
         stream.samples,
@@ -221,7 +221,7 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
     elif found.turns:
         lines.append("rate: too little turning, or too unlike, to tell the gyroscope's unit")
     if found.readings and tracker == "tracker":
-        others = max(made.share for made in found.readings.values())
+        others = max(made.explained for made in found.readings.values())
         lines.append(
             f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"
             f" another order or direction {100.0 * others:.1f} %"

@@ -1,7 +1,9 @@
-"""Is an estimate right, and does its covariance match its errors: scores, NEES, NIS, whiteness, diagnosis.
+"""Accuracy and consistency of an estimate: scores, NEES, NIS, whiteness, diagnosis.
 
-All modules without a leading underscore are public. A new score goes into `metrics`; a new fault that
-`diagnose` names gets its signature in `_fault_signatures`.
+`metrics` compares with ground truth, `consistency` computes the statistics of innovations and errors,
+`diagnosis` combines them into the sentences of `verdicts`. All modules without a leading underscore are
+public. A new score goes into `metrics`; a new fault that `diagnose` names gets its signature in
+`_fault_signatures`.
 """
 
 from jaxekf._support.lazy import attributes

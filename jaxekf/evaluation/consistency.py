@@ -1,6 +1,7 @@
-"""Whether errors are as large as they are said to be, and whether innovations are white.
+"""Consistency of a filter: NEES and NIS against their degrees of freedom, and whiteness of innovations.
 
-Statistics of arrays, for one run or several at once; `jaxekf.evaluation.diagnosis` says what they mean.
+The functions compute statistics of arrays, for one run or several; `jaxekf.evaluation.diagnosis` interprets
+them.
 """
 
 from collections.abc import Sequence
@@ -15,9 +16,9 @@ from jaxekf._support import chi_square
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Times, period_ns
 
 BAND = 0.95
-"""Share of honest samples that lie in a `Consistency.band`."""
+"""Share of samples of a consistent filter within a `Consistency.band`."""
 SURE = 0.999
-"""Probability with which an interval holds what it is of."""
+"""Confidence level of the intervals."""
 LONGEST_LAG_S = 2.0
 MOST_LAGS = 400
 _CERTAIN = 4.0
@@ -25,60 +26,60 @@ _CERTAIN = 4.0
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squares (NIS of innovations, NEES of errors) against their chi-square law."""
+    """Normalised squares (NIS of innovations, NEES of errors) against the chi-square distribution."""
 
     samples: int
     freedom: float
-    """Mean number of degrees of freedom of a sample."""
+    """Mean degrees of freedom of a sample."""
     mean: float
-    """Mean square by degree of freedom: 1 where honest, above where overconfident. NaN of none."""
+    """Mean square per degree of freedom: 1 for a consistent filter, above 1 if overconfident. NaN for no
+    samples."""
     effective: float
-    """Number of independent samples that would tell as much: fewer than `samples` where correlated."""
+    """Equivalent number of independent samples: fewer than `samples` if they are correlated."""
     interval: tuple[float, float]
-    """In which the true mean lies with a probability of `SURE`, by `effective` samples."""
+    """Confidence interval of the true mean at level `SURE`, from `effective` samples."""
     band: tuple[float, float]
-    """Square of a sample of the commonest number of degrees of freedom, in `BAND` of all cases."""
+    """Interval of a single square of the commonest degrees of freedom, with probability `BAND`."""
     inside: float
-    """Share of samples inside their band; `BAND` where honest."""
+    """Share of samples within their band; `BAND` for a consistent filter."""
     typical: float
-    """As `mean`, but from the median: what outliers do not move."""
+    """The same as `mean`, but from the median, which outliers do not change."""
     ks: float
-    """Kolmogorov-Smirnov distance of the squares from their law."""
+    """Kolmogorov-Smirnov distance between the squares and the chi-square distribution."""
     ks_p: float
-    """Its p-value, of samples so far apart that they are nearly independent."""
+    """Its p-value, from samples far enough apart to be nearly independent."""
 
     @property
     def factor(self) -> float:
-        """By how much deviations are larger than said: the root of `mean`."""
+        """Ratio of the actual to the predicted standard deviation: the root of `mean`."""
         return float(np.sqrt(self.mean))
 
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Innovations scaled by the root of their predicted covariance: independent and of variance 1 where
-    the filter is right."""
+    """Statistics of whitened innovations, which are independent with variance 1 for a consistent filter."""
 
     lag_s: Floats
-    """(L,) from one sampling period on."""
+    """(L,) s, from one sampling period on."""
     autocorrelation: Floats
-    """(rows, L), about zero: an innovation has no mean to be taken off."""
+    """(rows, L), about zero: an innovation has mean zero, which is not subtracted."""
     bound: Floats
-    """(L,) which a white row exceeds in 1 - `BAND` of all cases."""
+    """(L,) exceeded by a white row with probability 1 - `BAND`."""
     correlated_s: float
-    """Seconds within which the sum of the rows' mean autocorrelation gains 1 - 1/e of its largest (the
-    time constant of an exponential one); 0 where the sum is never certainly positive."""
+    """Correlation time, s: when the sum of the rows' mean autocorrelation reaches 1 - 1/e of its largest
+    value; 0 if the sum is never significantly positive."""
     total: float
     """Sum of the rows' mean autocorrelation over `lag_s`."""
     total_sigma: float
-    """Standard deviation of `total` where innovations are white."""
+    """Standard deviation of `total` for white innovations."""
     p: float
-    """Probability that white innovations look as correlated (Ljung-Box, all rows and lags)."""
+    """P-value of the Ljung-Box test over all rows and lags."""
     mean: Floats
-    """(rows,); 0 where nothing pushes to one side."""
+    """(rows,) mean; 0 for unbiased innovations."""
     mean_sigma: Floats
-    """(rows,) its standard deviation, autocorrelation taken into account."""
+    """(rows,) its standard deviation, with autocorrelation."""
     scale: Floats
-    """(rows,) root mean square: 1 where the row's noise is right."""
+    """(rows,) root mean square: 1 if the row's covariance is right."""
 
 
 def whiten(residual: Floats, cov: Floats, used: Flags) -> Floats:
@@ -95,9 +96,9 @@ def whiten(residual: Floats, cov: Floats, used: Flags) -> Floats:
 
 
 def on_grid(time_ns: Times, values: Floats) -> Floats:
-    """Values (N, rows) on a grid of the nominal period, NaN where there is none.
+    """Values (N, rows) on a grid of the nominal period, NaN in gaps, so that lags are times.
 
-    A gap then is a gap in lags, too. Samples that fit no such grid stay as they are, one a lag.
+    Samples that fit no such grid are returned as they are, one per lag.
     """
     period = period_ns(time_ns)
     if period <= 0:
@@ -113,13 +114,13 @@ def on_grid(time_ns: Times, values: Floats) -> Floats:
 def autocorrelation(series: Sequence[Floats], lags: int) -> tuple[Floats, Floats]:
     """Autocorrelation (rows, lags + 1) about zero of series (M, rows), and the number of pairs.
 
-    NaN values form no pairs. Several series are taken as draws of one law.
+    NaN values form no pairs. Several series are treated as realisations of one process.
     """
     products = pairs = np.zeros(0)
     for values in series:
-        seen = np.isfinite(values)
+        finite = np.isfinite(values)
         size: Any = next_fast_len(len(values) + lags + 1, real=True)
-        found = [_lagged(np.where(seen, values, 0.0), lags, size), _lagged(seen, lags, size)]
+        found = [_lagged(np.where(finite, values, 0.0), lags, size), _lagged(finite, lags, size)]
         products = found[0] if products.size == 0 else products + found[0]
         pairs = found[1] if pairs.size == 0 else pairs + found[1]
     pairs = np.round(pairs)
@@ -136,9 +137,9 @@ def _lagged(values: Any, lags: int, size: int) -> Floats:
 
 
 def inflation(series: Sequence[Floats], lags: int | None = None) -> float:
-    """By how much the variance of a mean is larger for the correlation of its samples, at least 1.
+    """Factor, at least 1, by which autocorrelation increases the variance of a mean.
 
-    Autocorrelations count until the first that is within its bound.
+    Autocorrelations up to the first one within its bound are summed.
     """
     count = sum(int(np.isfinite(values).sum()) for values in series)
     if count < 3:
@@ -152,11 +153,16 @@ def inflation(series: Sequence[Floats], lags: int | None = None) -> float:
 
 
 def judge_squares(squares: Sequence[Floats], freedom: Sequence[Any]) -> Consistency:
-    """Normalised squares of several runs, each (N,), in order of time, against their degrees of freedom.
+    """Normalised squares of several runs against the chi-square distribution.
 
-    Samples of no degree of freedom do not count.
+    Parameters
+    ----------
+    squares
+        Squares (N,) of each run in order of time.
+    freedom
+        Degrees of freedom (N,) of each run; samples with none are ignored.
     """
-    # Half of what this package's imports would take: only for those who ask whether a run is consistent.
+    # Slow to import, and only needed here.
     from scipy.stats import kstest
 
     kept = [f > 0 for f in freedom]
@@ -196,10 +202,18 @@ def judge_squares(squares: Sequence[Floats], freedom: Sequence[Any]) -> Consiste
 
 
 def judge_whiteness(times: Sequence[Times], whitened: Sequence[Floats]) -> Whiteness:
-    """Whitened innovations of several runs, times (N,) and values (N, rows), NaN where not used."""
+    """Whiteness of the innovations of several runs.
+
+    Parameters
+    ----------
+    times
+        Times (N,) of each run, ns.
+    whitened
+        Whitened innovations (N, rows) of each run, NaN in unused rows.
+    """
     periods = [period_ns(t) for t in times if len(t) > 1]
     period = float(np.median(periods)) / NANOSECONDS if periods else 1.0
-    # Those without a sample stay: of a sensor that no run read there is no other that tells its rows.
+    # Series without samples stay: they give the number of rows of a sensor that no run has read.
     series = [on_grid(t, w) for t, w in zip(times, whitened, strict=True)]
     longest = max((len(s) for s in series), default=0)
     wanted = int(np.clip(round(LONGEST_LAG_S / max(period, 1e-9)), 10, MOST_LAGS))

@@ -1,7 +1,7 @@
-"""Can an estimate be believed? Innovations and errors against what they are said to be, and why not.
+"""Diagnosis of an estimate: consistency of innovations and errors, and the cause of an inconsistency.
 
-`diagnose` judges one run, `diagnose_many` several with the same model and noise together. Innovations
-tell without any truth: they are white, and as large as their covariance, where the filter is right.
+`diagnose` judges one run, `diagnose_many` several with the same model and noise together. Innovations need
+no ground truth: for a consistent filter they are white and match their covariance.
 """
 
 from collections.abc import Sequence
@@ -31,12 +31,12 @@ from jaxekf.evaluation.metrics import normalised_square, scored_errors
 from jaxekf.evaluation.verdicts import (
     Fault,
     Verdict,
-    in_order,
+    insufficient_samples,
     judge_fault,
     judge_part,
     judge_sensor,
-    named_faults,
-    too_few,
+    significant_faults,
+    summary_line,
 )
 from jaxekf.geometry import manifold
 from jaxekf.recordings.types import Flags, Floats, Recording
@@ -52,56 +52,68 @@ _CURVE_DECIMALS = 5
 
 @dataclass(frozen=True)
 class SensorDiagnosis:
-    """What the innovations of one sensor tell."""
+    """Statistics of the innovations of one sensor."""
 
     nis: Consistency
-    """Gated samples count."""
+    """Gated samples are included."""
     whiteness: Whiteness
     faults: tuple[Fault, ...]
-    """Latency, gyroscope bias and matrix with their uncertainties, certain or not; of sensors of an
-    attitude only."""
+    """Latency, gyroscope bias and matrix with their uncertainties, significant or not; attitude sensors
+    only."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found on one run, or on several together."""
+    """Findings on one run, or on several together."""
 
     runs: tuple[str, ...]
     sensors: dict[str, SensorDiagnosis]
     parts: dict[str, Consistency]
-    """NEES of those outputs (attitude, rate, position, velocity) of which an encoder tells the truth."""
+    """NEES of the outputs (attitude, rate, position, velocity) for which an encoder provides ground
+    truth."""
     verdicts: tuple[Verdict, ...]
-    """What is wrong; empty where nothing speaks against the estimate."""
+    """Inconsistencies; empty if none was found."""
     notes: tuple[str, ...]
-    """What could not be judged, and why."""
+    """Statistics that could not be judged, with the reason."""
 
     def sentences(self) -> tuple[str, ...]:
-        """Verdicts for a person; where there are none, the numbers that speak for the estimate."""
+        """Verdicts as sentences; without any, one sentence with the statistics."""
         if self.verdicts:
             return tuple(str(verdict) for verdict in self.verdicts)
-        told = [in_order(f"NIS of {n}", s.nis) for n, s in self.sensors.items() if s.nis.samples]
-        told += [
-            in_order(f"NEES of {name}", part) for name, part in self.parts.items() if part.samples
+        lines = [
+            summary_line(f"NIS of {n}", s.nis) for n, s in self.sensors.items() if s.nis.samples
         ]
-        return (f"nothing speaks against it: {'; '.join(told)}",) if told else ()
+        lines += [
+            summary_line(f"NEES of {name}", part)
+            for name, part in self.parts.items()
+            if part.samples
+        ]
+        return (f"no inconsistency found: {'; '.join(lines)}",) if lines else ()
 
     def as_dict(self, *, curves: bool = False) -> dict[str, Any]:
-        """For JSON. With `curves` also the autocorrelation (rows, L) at each lag and its bound, rounded."""
+        """For JSON; with `curves` also the autocorrelation (rows, L) at each lag and its bound, rounded."""
         return {
             "runs": list(self.runs),
-            "verdicts": [_plain(verdict, curves) for verdict in self.verdicts],
+            "verdicts": [_json_value(verdict, curves) for verdict in self.verdicts],
             "notes": list(self.notes),
-            "sensors": {name: _plain(sensor, curves) for name, sensor in self.sensors.items()},
-            "parts": {name: _plain(part, curves) for name, part in self.parts.items()},
+            "sensors": {name: _json_value(sensor, curves) for name, sensor in self.sensors.items()},
+            "parts": {name: _json_value(part, curves) for name, part in self.parts.items()},
         }
 
 
 def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosis:
-    """Judge one estimate by its innovations and, with a recording that has an encoder, by its errors.
+    """Judge one estimate by its innovations and, with an encoder, by its errors.
 
-    Errors count at those instants whose nearest encoder sample is scored, as in `jaxekf.score`. Works for
-    every model; latency, gyroscope bias and matrix are looked for where a sensor measures an attitude and
-    the model puts out `attitude` and `rate`.
+    Errors count at instants whose nearest encoder sample is scored, as in `jaxekf.score`. The
+    function works for every model; latency, gyroscope bias and matrix are estimated if a sensor
+    measures an attitude and the model has the outputs `attitude` and `rate`.
+
+    Parameters
+    ----------
+    estimate
+        Estimate of a whole run.
+    recording
+        The run, if it has an encoder.
     """
     return diagnose_many([estimate], None if recording is None else [recording])
 
@@ -109,43 +121,46 @@ def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosi
 def diagnose_many(
     estimates: Sequence[Estimate], recordings: Sequence[Recording] | None = None
 ) -> Diagnosis:
-    """As `diagnose`, of several runs together: smaller faults are found, each run keeping its own bias.
+    """Judge several runs together, which finds smaller faults; each run keeps its own bias.
 
-    Raises `ValueError` for no estimates, for excerpts (`Estimate.requested`), or other recordings than the
-    estimates' own.
+    Raises
+    ------
+    ValueError
+        For no estimates, for excerpts (`Estimate.requested`), and for recordings that are not those of the
+        estimates.
     """
     _check(estimates, recordings)
-    names = list(dict.fromkeys(name for made in estimates for name in made.sensors))
+    names = list(dict.fromkeys(name for estimate in estimates for name in estimate.sensors))
     sensors, verdicts, notes = {}, [], []
     for name in names:
-        sensors[name], said = _judge_sensor(name, [e for e in estimates if name in e.sensors])
-        if note := too_few(name, sensors[name].nis):
+        sensors[name], found = _judge_sensor(name, [e for e in estimates if name in e.sensors])
+        if note := insufficient_samples(name, sensors[name].nis):
             notes.append(note)
         else:
-            verdicts += said
+            verdicts += found
     parts = {}
     for name, squares in _errors(estimates, recordings or []).items():
         parts[name] = judge_squares(squares, [np.full(len(s), 3) for s in squares])
-        if note := too_few(f"NEES of {name}", parts[name], truth=True):
+        if note := insufficient_samples(f"NEES of {name}", parts[name], truth=True):
             notes.append(note)
         else:
             verdicts += judge_part(name, parts[name])
-    runs = tuple(made.run for made in estimates)
+    runs = tuple(estimate.run for estimate in estimates)
     return Diagnosis(runs, sensors, parts, tuple(verdicts), tuple(notes))
 
 
 def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None) -> None:
     if not estimates:
         raise ValueError(
-            "got no estimates, expected at least one; pass those of jaxekf.estimate_many"
+            "got no estimates, expected at least one; pass the result of jaxekf.estimate_many"
         )
-    if excerpts := [made.run for made in estimates if made.excerpt]:
+    if excerpts := [estimate.run for estimate in estimates if estimate.excerpt]:
         raise ValueError(
-            f"got requested times of {excerpts} only, expected whole estimates, whose states the"
-            " innovations are compared with; pass the estimates that they are a part of"
+            f"got requested times of {excerpts} only, expected whole estimates, whose states belong"
+            " to the innovations; pass the estimates before the selection of times"
         )
     if recordings is not None:
-        runs, given = [made.run for made in estimates], [r.name for r in recordings]
+        runs, given = [estimate.run for estimate in estimates], [r.name for r in recordings]
         if runs != given:
             raise ValueError(
                 f"got recordings {given} for estimates of {runs}, expected the same runs in the same"
@@ -157,17 +172,17 @@ def _judge_sensor(
     name: str, estimates: Sequence[Estimate]
 ) -> tuple[SensorDiagnosis, list[Verdict]]:
     """Statistics of one sensor over several runs, and verdicts on them."""
-    records = [made.sensors[name] for made in estimates]
+    records = [estimate.sensors[name] for estimate in estimates]
     freedom = [(r.used | r.gated).sum(axis=1) for r in records]
     nis = judge_squares([r.nis for r in records], freedom)
     white = [whiten(r.residual, r.cov, r.used) for r in records]
     times = [r.time_ns for r in records]
     whiteness = judge_whiteness(times, white)
-    each = [find_faults(made, name) for made in estimates]
+    each = [find_faults(estimate, name) for estimate in estimates]
     known = [found for found in each if found is not None and found.rows]
     faults = _pooled(known)
     diagnosis = SensorDiagnosis(nis, whiteness, faults)
-    named = named_faults(faults)
+    named = significant_faults(faults)
     verdicts = [judge_fault(name, nis, fault) for fault in named]
     if named:
         rows = attitude_rows(estimates[0], name)
@@ -185,7 +200,7 @@ def _judge_sensor(
 
 
 def _pooled(found: Sequence[Faults]) -> tuple[Fault, ...]:
-    """Faults of several runs as one: latency and matrix shared, the bias each run's own."""
+    """Faults of several runs combined: latency and matrix are shared, the bias is per run."""
     if not found:
         return ()
     total = sum(each.rows for each in found)
@@ -212,27 +227,27 @@ def _pooled(found: Sequence[Faults]) -> tuple[Fault, ...]:
 def _errors(
     estimates: Sequence[Estimate], recordings: Sequence[Recording]
 ) -> dict[str, list[Floats]]:
-    """Normalised squares of the errors of each output of which there is truth, run by run."""
+    """Normalised squares of the errors of each output with ground truth, run by run."""
     found: dict[str, list[Floats]] = {}
-    for made, recording in zip(estimates, recordings, strict=False):
+    for estimate, recording in zip(estimates, recordings, strict=False):
         if recording.encoder is None:
             continue
-        for name, error in scored_errors(made, recording).items():
+        for name, error in scored_errors(estimate, recording).items():
             kept: Flags = np.asarray(np.isfinite(error).all(axis=1))
-            squares = normalised_square(error[kept], made.outputs[name].cov[kept])
+            squares = normalised_square(error[kept], estimate.outputs[name].cov[kept])
             found.setdefault(name, []).append(squares)
     return found
 
 
-def _plain(node: Any, curves: bool) -> Any:
-    """A dataclass as what JSON knows; curves rounded, or left out."""
+def _json_value(node: Any, curves: bool) -> Any:
+    """A dataclass as JSON values; curves rounded or left out."""
     if isinstance(node, Consistency | Whiteness | Fault | Verdict | SensorDiagnosis):
         named = {f.name: getattr(node, f.name) for f in fields(node)}
         for name in (name for name in _CURVES if name in named):
             curve = named.pop(name)
             if curves:
                 named[name] = np.round(curve, _CURVE_DECIMALS)
-        return {key: _plain(value, curves) for key, value in named.items()}
+        return {key: _json_value(value, curves) for key, value in named.items()}
     if isinstance(node, np.ndarray):
         return node.tolist()
-    return [_plain(item, curves) for item in node] if isinstance(node, tuple) else node
+    return [_json_value(item, curves) for item in node] if isinstance(node, tuple) else node

@@ -1,4 +1,4 @@
-"""How good an estimate is: error against truth, and whether its uncertainty is honest."""
+"""Accuracy against ground truth: RMSE of attitude, rate and position, and NEES."""
 
 from typing import Any, NamedTuple
 
@@ -10,17 +10,17 @@ from jaxekf.recordings.types import Encoder, Flags, Floats, Optical, Recording, 
 
 
 class Score(NamedTuple):
-    """Agreement of one estimate with its encoder on the scored samples."""
+    """Accuracy of one estimate on the scored samples of its encoder."""
 
     attitude_rmse_deg: float
     rate_rmse_deg_s: float
     attitude_nees: float
-    """Mean normalised estimation error squared by degree of freedom: 1 where honest, above 1 where
-    overconfident."""
+    """Mean normalised estimation error squared per degree of freedom: 1 for a consistent filter, above 1
+    for an overconfident one."""
     position_rmse_mm: float
-    """Root mean square of the distance to the encoder's position; NaN where either has none."""
+    """Root mean square of the distance to the encoder's position, mm; NaN if either has no position."""
     position_nees: float
-    """As `attitude_nees`, of the position."""
+    """NEES of the position, as `attitude_nees`."""
     samples: int
 
     def as_dict(self) -> dict[str, Any]:
@@ -29,26 +29,31 @@ class Score(NamedTuple):
 
 
 def attitude_error(q: Floats, truth: Floats) -> Floats:
-    """Rotation vectors (N, 3) in radians from `q` to `truth`, in the body frame of `q`."""
+    """Rotation vectors (N, 3), rad, from `q` to `truth`, in the body frame of `q`."""
     return (to_scipy(q).inv() * to_scipy(truth)).as_rotvec()
 
 
 class OrientationError(NamedTuple):
-    """Root mean squares of the angle between estimate and truth, and of its two parts, in degrees."""
+    """Root mean square of the angle between estimate and truth, and of its two parts, degrees."""
 
     total_deg: float
     heading_deg: float
-    """Of its turn about the vertical."""
+    """Rotation about the vertical."""
     inclination_deg: float
-    """Of what is left: the least turn that puts the vertical right."""
+    """The remaining smallest rotation, which aligns the vertical."""
 
 
 def orientation_error(
     q: Floats, truth: Floats, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
 ) -> OrientationError:
-    """Errors of quaternions (N, 4), body to reference, as BROAD counts them (Laidig et al. 2021).
+    """Orientation errors as defined by the BROAD data set (Laidig et al. 2021), without heading alignment.
 
-    `up` is the vertical in the reference frame. No offset of the heading is taken off.
+    Parameters
+    ----------
+    q, truth
+        (N, 4) quaternions, body to reference.
+    up
+        Vertical in the reference frame.
     """
     off = (to_scipy(q) * to_scipy(truth).inv()).as_quat()
     vertical = np.asarray(up) / np.linalg.norm(up)
@@ -62,27 +67,33 @@ def orientation_error(
 
 
 def rms(values: Floats) -> float:
-    """Root of the mean square of the lengths of vectors (N, d); NaN rows do not count."""
+    """Root mean square of the lengths of vectors (N, d); NaN rows are ignored."""
     squared = np.sum(np.asarray(values) ** 2, axis=-1)
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(np.mean(squared))) if squared.size else float("nan")
 
 
 def normalised_square(error: Floats, cov: Floats) -> Floats:
-    """``e' inv(P) e`` for each of (N, d), (N, d, d)."""
+    """``e' inv(P) e`` (N,) of errors (N, d) and covariances (N, d, d)."""
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
 
 
 def mean_nees(error: Floats, cov: Floats) -> float:
-    """Mean of ``e' inv(P) e / d`` over (N, d), (N, d, d); NaN of none."""
+    """Mean of ``e' inv(P) e / d`` over errors (N, d) and covariances (N, d, d); NaN for none."""
     squared = normalised_square(error, cov)
     return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
 
 
 def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
-    """Errors (N, 3) of those outputs (attitude, rate, position, velocity) of which the encoder tells the
-    truth; NaN at instants whose nearest encoder sample is not scored or not known. SI; of an attitude the
-    rotation vector in the body frame. Raises `RecordingError` for a run without an encoder.
+    """Errors (N, 3) of the outputs attitude, rate, position and velocity against the encoder.
+
+    Attitude errors are rotation vectors in the body frame, all in SI units. Instants whose nearest encoder
+    sample is not scored or not known are NaN.
+
+    Raises
+    ------
+    RecordingError
+        If the run has no encoder.
     """
     encoder, outputs = recording.need_encoder(), estimate.outputs
     truth = encoder_at(encoder, estimate.time_ns)
@@ -100,11 +111,16 @@ def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats
 
 
 def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> Score:
-    """Errors of attitude, rate and position, and NEES of attitude and position, at those instants of the
-    estimate whose nearest encoder sample is scored.
+    """RMSE of attitude, rate and position, and NEES of attitude and position.
 
-    What the model does not put out, or the encoder does not tell, is NaN. Positions are those of the
-    body's origin in the reference frame. Raises `RecordingError` for a run without an encoder.
+    Errors count at instants of the estimate whose nearest encoder sample is scored, from `burn_in_s`
+    on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
+    body's origin in the reference frame.
+
+    Raises
+    ------
+    RecordingError
+        If the run has no encoder.
     """
     truth = encoder_at(recording.need_encoder(), estimate.time_ns)
     judged = truth.scored & (estimate.time >= burn_in_s)
@@ -122,7 +138,7 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
 
 
 def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple[float, float]:
-    """RMSE in mm and NEES of the position; a blank cell of the encoder's position does not count."""
+    """RMSE in mm and NEES of the position; a blank position of the encoder is ignored."""
     if "position" not in estimate.outputs or truth.position is None:
         return float("nan"), float("nan")
     judged = judged & np.isfinite(truth.position).all(axis=1)
@@ -132,14 +148,14 @@ def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:
-    """The last visible tracker attitude (N, 4) at each time: what there is without a filter."""
-    seen = np.flatnonzero(optical.valid)
-    at = np.searchsorted(optical.time_ns[seen], time_ns, side="right") - 1
-    return optical.q_ref_body[seen[np.maximum(at, 0)]]
+    """The last visible attitude (N, 4) of the tracker at each time: the baseline without a filter."""
+    rows = np.flatnonzero(optical.valid)
+    at = np.searchsorted(optical.time_ns[rows], time_ns, side="right") - 1
+    return optical.q_ref_body[rows[np.maximum(at, 0)]]
 
 
 def score_hold_last(recording: Recording, time_ns: Times) -> float:
-    """Attitude RMSE in degrees of holding the tracker, on the encoder's scored samples."""
+    """Attitude RMSE, degrees, of the baseline `hold_last` on the encoder's scored samples."""
     truth = encoder_at(recording.need_encoder(), time_ns)
     held = hold_last(recording.need_optical(), time_ns)
     error = attitude_error(held[truth.scored], truth.q_ref_body[truth.scored])
@@ -147,7 +163,7 @@ def score_hold_last(recording: Recording, time_ns: Times) -> float:
 
 
 def score_raw_rate(recording: Recording) -> float:
-    """Rate RMSE in deg/s of the gyroscope as it is, bias and noise included."""
+    """Rate RMSE, deg/s, of the gyroscope's samples, bias and noise included."""
     imu = recording.need_imu()
     scored = encoder_at(recording.need_encoder(), imu.time_ns).scored
     error = imu.gyroscope - encoder_rate_at(recording.need_encoder(), imu.time_ns)

@@ -1,9 +1,9 @@
-"""What the statistics of innovations and errors mean, in words, and what to look for.
+"""Verdicts: an inconsistency in words, with its likely cause.
 
-One fault shows in many statistics. So what a known fault explains is taken out of the innovations before
-the rest is judged, and of the rest's size and correlation only their pattern names a cause: with too
-little noise given to a sensor the gain is too high, which leaves no positive correlation; with too little
-given to the prediction, or an error that lasts, it does.
+One fault changes many statistics. So the part that an identified fault explains is removed from the
+innovations before the rest is judged, and the cause follows from the pattern of size and correlation: too
+small a measurement noise makes the gain too high, which leaves no positive correlation; too small a process
+noise, or a persistent error, leaves a positive one.
 """
 
 from collections.abc import Sequence
@@ -11,21 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.evaluation.consistency import BAND, Consistency, Whiteness
 
 FEWEST = 50
-"""Samples without which there is no verdict."""
+"""Fewest samples for a verdict."""
 FEWEST_EFFECTIVE = 10.0
-"""The same for independent samples of errors against truth."""
+"""Fewest effectively independent samples of errors against ground truth."""
 _FACTOR = 1.1
-"""Deviations wrong by less are not worth a word."""
+"""Smallest ratio of standard deviations that is reported."""
 _PART_FACTOR = 1.2
 _FAULT_P = 1e-8
 _WHITE_P = 1e-6
 _EFFECT = 0.1
-"""A fault that leaves less in innovations, against noise of 1, is not worth a word."""
+"""Smallest effect of a fault in whitened innovations that is reported."""
 _LESSER = 0.25
-"""A fault of less effect than this share of the largest may be what its linearisation left over."""
+"""A fault with less effect than this share of the largest may be its linearisation error."""
 _CORRELATION = 0.05
 _SUM = 0.5
 _SIGMAS = 6.0
@@ -34,51 +35,50 @@ _SLOW = 2.5
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that is not noise, found in the innovations of an attitude."""
+    """A systematic error found in the innovations of an attitude."""
 
     kind: str
     """`latency`, `gyroscope_bias` or `gyroscope_matrix`."""
     size: tuple[float, ...]
-    """Seconds by which samples are older than stamped; rad/s by which the bias is off; the gyroscope's
-    matrix less what it was taken for, by rows."""
+    """Latency in s; bias error in rad/s; or gyroscope matrix minus the assumed one, by rows."""
     sigma: tuple[float, ...]
     unit: str
     p: float
-    """Probability of as much where there is none."""
+    """P-value of the hypothesis that there is no fault."""
     effect: float
-    """Root mean square of what it leaves in whitened innovations, of which noise leaves 1."""
+    """Root mean square contribution to whitened innovations, whose noise is 1."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One thing that is wrong, for a program and for a person."""
+    """One inconsistency, for a program and for a person."""
 
     kind: str
     """`noise_too_small`, `noise_too_large`, `process_noise_too_large`, `outliers`, `correlated`, `biased`,
     `latency`, `gyroscope_bias`, `gyroscope_matrix`, `overconfident` or `underconfident`."""
     about: str
-    """The sensor, or the output that was compared with truth."""
+    """The sensor, or the output that was compared with ground truth."""
     factor: float
-    """How many times larger deviations are than said; below 1 where they are smaller."""
+    """Ratio of the actual to the predicted standard deviation."""
     size: float | None
-    """How large the fault is, in `unit`, where it has a size of its own."""
+    """Size of the fault in `unit`; None for a verdict without one."""
     unit: str
     sentence: str
-    """What was seen, and what to look for."""
+    """The finding and its likely cause."""
 
     def __str__(self) -> str:
         return self.sentence
 
 
-def named_faults(faults: Sequence[Fault]) -> list[Fault]:
-    """Those faults that are certain, and matter."""
+def significant_faults(faults: Sequence[Fault]) -> list[Fault]:
+    """The faults that are significant and large enough to matter."""
     largest = max((fault.effect for fault in faults), default=0.0)
     least = max(_EFFECT, _LESSER * largest)
     return [fault for fault in faults if fault.p < _FAULT_P and fault.effect >= least]
 
 
 def judge_fault(sensor: str, nis: Consistency, fault: Fault) -> Verdict:
-    """The verdict on a certain fault."""
+    """The verdict on a significant fault."""
     size, sigma = np.array(fault.size), np.array(fault.sigma)
     if fault.kind == "latency":
         worth = float(size[0])
@@ -92,14 +92,14 @@ def judge_fault(sensor: str, nis: Consistency, fault: Fault) -> Verdict:
         worth = float(np.linalg.norm(size))
         each = ", ".join(f"{x:.3f}" for x in np.rad2deg(size))
         sentence = (
-            f"innovations of {sensor} keep to one side as with a gyroscope bias off by ({each}) deg/s: the"
-            " bias is held fixed, its walk is too small, or its initial deviation is; widen them"
+            f"innovations of {sensor} have the mean of a gyroscope bias error of ({each}) deg/s: the bias"
+            " is fixed, or its random walk or initial deviation is too small; increase them"
         )
     else:
         worth = float(np.abs(size).max())
         sentence = (
-            f"innovations of {sensor} follow the integrated rate as with a gyroscope matrix off by"
-            f" {100 * worth:.1f} %: look for scale or misalignment of the gyroscope, and tune the"
+            f"innovations of {sensor} follow the integrated rate as with a gyroscope matrix error of"
+            f" {100 * worth:.1f} %: check scale and misalignment of the gyroscope, and tune the"
             " calibration"
         )
     return Verdict(fault.kind, sensor, nis.factor, worth, fault.unit, sentence)
@@ -114,10 +114,20 @@ def judge_sensor(
     memory_s: float | None = None,
     explained: Sequence[Fault] = (),
 ) -> list[Verdict]:
-    """Verdicts on a sensor's innovations, without those faults that are `explained` already.
+    """Verdicts on a sensor's innovations, without the `explained` faults.
 
-    `labels` name the sensor's rows; `memory_s` is the filter's time constant under this sensor, where it
-    is known.
+    Parameters
+    ----------
+    sensor
+        Name of the sensor.
+    nis, white
+        Statistics of its innovations.
+    labels
+        Names of the sensor's rows.
+    memory_s
+        Time constant of the filter under this sensor, s, if it is known.
+    explained
+        Faults that are removed from the innovations already.
     """
     known = [fault.kind for fault in explained]
     found, rest = [], f"the rest of the innovations of {sensor}" if explained else sensor
@@ -127,14 +137,14 @@ def judge_sensor(
     positive = (certain and first > _CORRELATION) or (sums and white.total > _SUM)
     negative = not positive and (certain or sums) and white.total < 0.0
     if "gyroscope_bias" in known:
-        positive = False  # A bias that wanders while it is held leaves more than its mean explains.
+        positive = False  # A drifting bias that is held fixed leaves more than its mean explains.
     left = np.sqrt(max(nis.mean - 1.0, 0.0))
     if left < _LESSER * max((fault.effect for fault in explained), default=0.0):
-        positive = False  # What a large fault leaves beyond first order.
+        positive = False  # The rest of a large fault beyond first order.
     one_sided = bool(np.any(np.abs(white.mean) > np.maximum(_SIGMAS * white.mean_sigma, _EFFECT)))
     slow = positive and memory_s is not None and white.correlated_s > _SLOW * memory_s
     if "gyroscope_bias" not in known and (one_sided or slow):
-        found.append(_lasting(sensor, nis, white, memory_s))
+        found.append(_biased(sensor, nis, white, memory_s))
         positive = False
     off = not nis.interval[0] <= 1.0 <= nis.interval[1]
     large, small = off and nis.factor > _FACTOR, off and nis.factor < 1.0 / _FACTOR
@@ -148,8 +158,8 @@ def judge_sensor(
                 "process_noise_too_large",
                 sensor,
                 nis,
-                f"innovations of {sensor} are {1 / nis.factor:.2f} times smaller than said and change sides"
-                " too often: the process noise (of the gyroscope, or of the motion) is set too large",
+                f"innovations of {sensor} are {1 / nis.factor:.2f} times smaller than predicted and change"
+                " sign too often: the process noise (of the gyroscope, or of the motion) is set too large",
             )
         )
     elif small:
@@ -159,7 +169,7 @@ def judge_sensor(
                 sensor,
                 nis,
                 f"{sensor} noise is set too large by {1 / nis.factor:.2f}x (deviation): lower it or"
-                " tune it, or the process noise where that is the larger part of what is said"
+                " tune it, or the process noise if that is the larger part of the covariance"
                 f"{_by_row(labels, white)}",
             )
         )
@@ -171,12 +181,12 @@ def _verdict(kind: str, about: str, squares: Consistency, sentence: str) -> Verd
 
 
 def _by_row(labels: Sequence[str], white: Whiteness) -> str:
-    """Which rows stand out, where they are not all alike."""
+    """The rows with the smallest and the largest scale, if they differ clearly."""
     low, high = int(np.argmin(white.scale)), int(np.argmax(white.scale))
     if white.scale[high] < 1.25 * white.scale[low]:
         return ""
     shown = [f"{labels[i] or 'its row'} {white.scale[i]:.2f}x" for i in (low, high)]
-    return f"; rows differ, from {shown[0]} to {shown[1]} of what is said"
+    return f"; rows differ, from {shown[0]} to {shown[1]} of the predicted deviation"
 
 
 def _too_small(sensor: str, nis: Consistency, white: Whiteness, labels: Sequence[str]) -> Verdict:
@@ -186,8 +196,8 @@ def _too_small(sensor: str, nis: Consistency, white: Whiteness, labels: Sequence
             "outliers",
             sensor,
             nis,
-            f"most innovations of {sensor} are as large as said, a few are far larger (mean square"
-            f" {nis.mean:.2f}, typical {nis.typical:.2f}): look for outliers, and gate them",
+            f"most innovations of {sensor} are as large as predicted, a few are far larger (mean square"
+            f" {nis.mean:.2f}, typical {nis.typical:.2f}): check for outliers, and gate them",
         )
     return _verdict(
         "noise_too_small",
@@ -198,29 +208,29 @@ def _too_small(sensor: str, nis: Consistency, white: Whiteness, labels: Sequence
     )
 
 
-def _lasting(sensor: str, nis: Consistency, white: Whiteness, memory_s: float | None) -> Verdict:
-    """Innovations that keep to one side, or wander far more slowly than the filter forgets."""
+def _biased(sensor: str, nis: Consistency, white: Whiteness, memory_s: float | None) -> Verdict:
+    """Innovations with a mean, or correlated for much longer than the filter's time constant."""
     shown = ", ".join(f"{x:.2f}" for x in white.mean)
     if memory_s is None:
         return _verdict(
             "biased",
             sensor,
             nis,
-            f"innovations of {sensor} are off to one side by ({shown}) of their deviations: look for a bias"
-            " that is held fixed, or an error of alignment, lever arm, geometry or gravity",
+            f"innovations of {sensor} have a mean of ({shown}) of their deviations: check for a fixed bias,"
+            " or an error of alignment, lever arm, geometry or gravity",
         )
     return _verdict(
         "gyroscope_bias",
         sensor,
         nis,
-        f"innovations of {sensor} wander over {_lasts(white)}, on average ({shown}) of their deviations off"
-        " to one side: the gyroscope's bias is held fixed or its walk is too small, or gravity, where it is"
-        " used, is wrong",
+        f"innovations of {sensor} drift over {_correlation_time(white)}, with a mean of ({shown}) of their"
+        " deviations: the gyroscope's bias is fixed or its random walk is too small, or gravity is wrong in"
+        " a model that uses it",
     )
 
 
-def _lasts(white: Whiteness) -> str:
-    """For how long innovations are correlated, in words."""
+def _correlation_time(white: Whiteness) -> str:
+    """Correlation time in words."""
     if white.correlated_s >= 0.6 * white.lag_s[-1]:
         return f"{white.lag_s[-1]:.2g} s and longer"
     return f"{white.correlated_s:.2g} s"
@@ -229,18 +239,18 @@ def _lasts(white: Whiteness) -> str:
 def _correlated(
     sensor: str, nis: Consistency, white: Whiteness, memory_s: float | None, rest: str
 ) -> Verdict:
-    """Positive correlation: the prediction errs for longer than the filter thinks."""
+    """Positive correlation: the prediction errs for longer than the filter assumes."""
     look = "latency, misalignment or wrong geometry, or process noise that is set too small"
     if memory_s is not None:
         look = "process noise (of the gyroscope, or of the motion) that is set too small"
-    size = f" and {nis.factor:.2f} times as large as said" if nis.factor > _FACTOR else ""
+    size = f" and {nis.factor:.2f} times as large as predicted" if nis.factor > _FACTOR else ""
     name = f"{rest} is" if rest != sensor else f"innovations of {sensor} are"
-    sentence = f"{name} correlated over {_lasts(white)}{size}: look for {look}"
+    sentence = f"{name} correlated over {_correlation_time(white)}{size}: check for {look}"
     return _verdict("correlated", sensor, nis, sentence)
 
 
 def judge_part(part: str, nees: Consistency) -> list[Verdict]:
-    """Verdicts on errors against truth."""
+    """Verdicts on errors against ground truth."""
     if nees.interval[0] <= 1.0 <= nees.interval[1]:
         return []
     if nees.factor > _PART_FACTOR:
@@ -249,8 +259,8 @@ def judge_part(part: str, nees: Consistency) -> list[Verdict]:
                 "overconfident",
                 part,
                 nees,
-                f"errors of {part} are {nees.factor:.2f} times as large as said: do not trust its"
-                " deviations",
+                f"errors of {part} are {nees.factor:.2f} times as large as predicted: its deviations are"
+                " too small",
             )
         ]
     if nees.factor < 1.0 / _PART_FACTOR:
@@ -259,29 +269,35 @@ def judge_part(part: str, nees: Consistency) -> list[Verdict]:
                 "underconfident",
                 part,
                 nees,
-                f"errors of {part} are {1 / nees.factor:.2f} times smaller than said: noise is set"
+                f"errors of {part} are {1 / nees.factor:.2f} times smaller than predicted: noise is set"
                 " too large",
             )
         ]
     return []
 
 
-def too_few(about: str, squares: Consistency, *, truth: bool = False) -> str:
-    """Why there is no verdict on a sensor or part; empty where there is enough to judge."""
+def insufficient_samples(about: str, squares: Consistency, *, truth: bool = False) -> str:
+    """Reason why there is no verdict on a sensor or output; empty if there are samples enough."""
     if squares.samples < FEWEST:
         return f"{about}: {squares.samples} samples are too few to judge, {FEWEST} are needed"
     if truth and squares.effective < FEWEST_EFFECTIVE:
         return (
-            f"{about}: errors last so long that {squares.samples} samples tell as much as"
+            f"{about}: errors are so correlated that {squares.samples} samples equal"
             f" {squares.effective:.0f} independent ones, too few to judge ({FEWEST_EFFECTIVE:.0f})"
         )
     return ""
 
 
-def in_order(about: str, squares: Consistency) -> str:
-    """Numbers on which a verdict is based, in a line."""
+def summary_line(about: str, squares: Consistency) -> str:
+    """The statistics behind a verdict in one line."""
     low, high = squares.interval
     return (
         f"{about} {squares.mean:.2f} ({low:.2f} to {high:.2f}), {100 * squares.inside:.0f} % inside the"
         f" {100 * BAND:.0f} % band"
     )
+
+
+__getattr__ = renamed(
+    __name__,
+    "in_order>summary_line named_faults>significant_faults too_few>insufficient_samples",
+)

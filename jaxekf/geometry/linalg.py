@@ -1,9 +1,12 @@
 """Small dense linear algebra for the filter: sizes are static and tiny, so loops are unrolled.
 
-Inside a ``lax.scan`` on a CPU a call to LAPACK, or a tiny ``dot``, costs far more than its
-arithmetic; these functions are plain arithmetic which XLA fuses. Matrices stand on the **first** axes;
-whatever axes follow are *lanes*: independent problems, usually runs, side by side in memory.
+Inside a ``lax.scan`` on a CPU a call to LAPACK, or a tiny ``dot``, costs far more than its arithmetic;
+these functions are plain arithmetic which XLA fuses. Matrix indices are the **first** axes; all further
+axes are *lanes*: independent problems, usually runs, next to each other in memory.
 """
+
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -15,7 +18,7 @@ def symmetrise(matrix: Array) -> Array:
 
 
 def diagonal(matrix: Array) -> Array:
-    """Diagonal, (n, n, ...) to (n, ...)."""
+    """Diagonal, shape (n, n, ...) to (n, ...)."""
     return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
 
 
@@ -35,18 +38,31 @@ def congruence(left: Array, matrix: Array) -> Array:
 
 
 def identity_like(matrix: Array) -> Array:
-    """The identity broadcast to the shape (n, n, ...) of `matrix`."""
+    """Identity matrix broadcast to the shape (n, n, ...) of `matrix`."""
     size = matrix.shape[0]
     eye = jnp.eye(size, dtype=matrix.dtype).reshape((size, size) + (1,) * (matrix.ndim - 2))
     return jnp.broadcast_to(eye, matrix.shape)
 
 
 def standard_deviation_factor(deviation: Array, dim: int) -> Array:
-    """Lower factor ``L`` (dim, dim), ``L @ L.T`` the covariance, of a noise parameter.
+    """Lower-triangular factor ``L`` of the covariance ``L @ L.T`` that a noise parameter describes.
 
-    A noise parameter is a standard deviation for all axes, shape (); one for each axis, shape
-    (dim,); or already a lower-triangular factor, shape (dim, dim). What lies above the diagonal of
-    a factor is ignored.
+    Parameters
+    ----------
+    deviation
+        Standard deviation of all axes, shape (); of each axis, shape (dim,); or a lower-triangular factor,
+        shape (dim, dim), whose entries above the diagonal are ignored.
+    dim
+        Number of axes.
+
+    Returns
+    -------
+    (dim, dim) lower-triangular factor.
+
+    Raises
+    ------
+    ValueError
+        For any other shape.
     """
     deviation = jnp.asarray(deviation)
     if deviation.ndim == 0:
@@ -62,25 +78,48 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
 
 
 def covariance(deviation: Array, dim: int) -> Array:
-    """Covariance (dim, dim) of a noise parameter, see `standard_deviation_factor`."""
+    """Covariance (dim, dim) of a noise parameter; see `standard_deviation_factor`."""
     factor = standard_deviation_factor(deviation, dim)
     return factor @ factor.T
 
 
-def mask_covariance(matrix: Array, mask: Array) -> Array:
-    """``matrix`` with hidden rows and columns replaced by those of the identity, (m, m, ...), (m, ...).
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """The block-diagonal matrix (n, n) of square matrices, in order."""
+    return jnp.block(
+        [
+            [row if i == j else jnp.zeros((len(row), len(b))) for j, b in enumerate(blocks)]
+            for i, row in enumerate(blocks)
+        ]
+    )
 
-    What is left is exactly the visible sub-block, so that a factor of it whitens the visible rows
-    as if the hidden ones had never been there, correlations included.
+
+def block_covariance(deviations: Sequence[Any], dims: Sequence[int] | None = None) -> Array:
+    """Block-diagonal covariance of independent noise parameters, of three axes each or of `dims`."""
+    dims = dims or (3,) * len(deviations)
+    return block_diagonal([covariance(d, dim) for d, dim in zip(deviations, dims, strict=True)])
+
+
+def adjugate(matrix: Array) -> tuple[Array, Array]:
+    """Adjugate (3, 3) and determinant () of a matrix (3, 3): the inverse is their ratio."""
+    a, b, c = matrix
+    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+    return rows, jnp.sum(a * rows[:, 0])
+
+
+def mask_covariance(matrix: Array, mask: Array) -> Array:
+    """Covariance (m, m, ...) whose rows and columns outside `mask` (m, ...) are those of the identity.
+
+    The visible sub-block is unchanged, so a factor of the result whitens the visible rows as if the masked
+    ones did not exist, correlations included.
     """
     both = mask[:, None] & mask[None, :]
     return jnp.where(both, matrix, identity_like(matrix))
 
 
 def whitener(matrix: Array) -> tuple[Array, Array]:
-    """Lower Cholesky factor of a small positive definite matrix, and one over its diagonal.
+    """Lower Cholesky factor of a small positive definite matrix, and the reciprocals of its diagonal.
 
-    Shapes (m, m, ...) to (m, m, ...), (m, ...). NaN where the matrix is not definite.
+    Shapes (m, m, ...) to (m, m, ...) and (m, ...). The result is NaN if the matrix is not definite.
     """
     size = matrix.shape[0]
     rows: list[list[Array]] = []
@@ -103,10 +142,10 @@ def whitener(matrix: Array) -> tuple[Array, Array]:
 
 
 def semidefinite_factor(matrix: Array) -> Array:
-    """Lower factor ``L``, ``L @ L.T == matrix``, of a positive semidefinite matrix, (n, n, ...).
+    """Lower factor ``L``, ``L @ L.T == matrix``, of a positive semidefinite matrix (n, n, ...).
 
-    Where nothing but rounding is left of a variance its column is zero, with derivative zero. NaN
-    where the matrix is not semidefinite.
+    A variance that is zero up to rounding gives a zero column with zero derivative. The result is NaN
+    if the matrix is not semidefinite.
     """
     size = matrix.shape[0]
     index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
@@ -132,7 +171,7 @@ def semidefinite_factor(matrix: Array) -> Array:
 
 
 def whiten(white: tuple[Array, Array], right: Array) -> Array:
-    """``inv(factor) @ right`` with what `whitener` returned, right (m, ...) or (m, n, ...)."""
+    """``inv(factor) @ right`` with the result of `whitener`, right (m, ...) or (m, n, ...)."""
     factor, inverses = white
     if right.ndim == factor.ndim:
         factor, inverses = factor[:, :, None], inverses[:, None]
@@ -146,7 +185,7 @@ def whiten(white: tuple[Array, Array], right: Array) -> Array:
 
 
 def squared_distance(residual: Array, cov: Array) -> Array:
-    """``r' inv(S) r``, shapes (m, ...), (m, m, ...) to (...)."""
+    """Squared Mahalanobis distance ``r' inv(S) r``, shapes (m, ...), (m, m, ...) to (...)."""
     white = whiten(whitener(cov), residual)
     total = white[0] * white[0]
     for w in white[1:]:

@@ -1,11 +1,11 @@
-"""State spaces: what a state is made of, and how a small error moves it.
+"""State spaces: the parts of a state, and how an error vector moves it.
 
-A state is a NamedTuple of arrays. Its *space* is the same NamedTuple type holding manifolds instead
-of arrays, one for each field (nesting is allowed). From this one declaration come the size of the
-error vector, the place of each part in it, labels, units and column headers.
+A state is a NamedTuple of arrays. Its *space* is the same NamedTuple type with manifolds instead of arrays,
+one for each field; nesting is allowed. From this declaration follow the size of the error vector, the slice
+of each part, labels, units and column headers.
 
-Errors act on the right, in the body frame: ``local(x, retract(x, delta)) == delta`` for errors
-inside the injectivity radius, and ``retract(x, local(x, y))`` is ``y`` (for rotations up to sign).
+Errors act on the right, in the body frame: ``local(x, retract(x, delta)) == delta`` for errors within the
+injectivity radius, and ``retract(x, local(x, y))`` is ``y`` (for rotations up to sign).
 """
 
 from abc import ABC, abstractmethod
@@ -22,15 +22,15 @@ _AXES = ("x", "y", "z")
 
 
 class Manifold(ABC):
-    """One part of a state: how it is stored, how an error vector moves it, and its names.
+    """One part of a state: its storage, its error vector and its names.
 
-    A manifold of your own gives the abstract members; the derivatives below have defaults by autodiff.
+    A new manifold defines the abstract members; the derivatives have defaults by autodiff.
     """
 
     unit: str
     """Unit of the error vector."""
     frame: str = "body"
-    """Frame in which the error vector is counted."""
+    """Frame of the error vector."""
 
     @property
     @abstractmethod
@@ -45,7 +45,7 @@ class Manifold(ABC):
     @property
     @abstractmethod
     def component_labels(self) -> tuple[str, ...]:
-        """Suffix of each stored number, for column headers."""
+        """Suffix of each stored component, for column headers."""
 
     @property
     @abstractmethod
@@ -76,7 +76,7 @@ class Manifold(ABC):
     def reset_jacobian(self, delta: Array) -> Array:
         """Derivative, at zero, of ``e -> local(retract(x, delta), retract(x, delta + e))``.
 
-        The default holds where it does not depend on ``x``, as for a Lie group.
+        It must not depend on ``x``, as is the case for a Lie group.
         """
         raise TypeError(
             f"got the curved manifold {type(self).__name__} without reset_jacobian, expected one;"
@@ -86,7 +86,7 @@ class Manifold(ABC):
 
 @dataclass(frozen=True)
 class Euclidean(Manifold):
-    """A vector of `size` numbers; the error is added."""
+    """A vector of `size` components with additive error."""
 
     size: int
     unit: str = ""
@@ -168,10 +168,10 @@ class SO3(Manifold):
 
 @dataclass(frozen=True)
 class AdditiveQuaternion(Manifold):
-    """A quaternion treated as four numbers, as Cheng (2023) does; the error is added.
+    """A quaternion as four independent components with additive error, as in Cheng (2023).
 
-    The two signs of a quaternion are one rotation, so `local` takes the sign of ``y`` that is nearer
-    to ``x``. Nothing keeps the norm at one: the model's `project` does.
+    Both signs of a quaternion are the same rotation, so `local` takes the sign of ``y`` nearer to
+    ``x``. The norm is not constrained here; the model's `project` normalises it.
     """
 
     unit: str = ""
@@ -210,7 +210,7 @@ class AdditiveQuaternion(Manifold):
 
 
 class Part(NamedTuple):
-    """Where one leaf of a space stands: its name, its manifold and its place in the error vector."""
+    """One leaf of a space: its name, its manifold and its slice of the error vector."""
 
     name: str
     manifold: Manifold
@@ -227,7 +227,7 @@ def _flatten(space: Any, *states: Any) -> tuple[list[Manifold], list[list[Array]
 
 
 def parts(space: Any) -> tuple[Part, ...]:
-    """The leaves of a space in order, with their names and their places in the error vector."""
+    """The leaves of a space in order, with their names and slices of the error vector."""
     found, start = [], 0
     for path, manifold in jax.tree_util.tree_flatten_with_path(space, is_leaf=_is_manifold)[0]:
         name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
@@ -251,7 +251,7 @@ def error_labels(space: Any) -> tuple[str, ...]:
 
 
 def component_labels(space: Any) -> tuple[str, ...]:
-    """Name of each stored number, ``q_ref_body_w`` for instance."""
+    """Name of each stored component, ``q_ref_body_w`` for instance."""
     return tuple(
         "_".join(filter(None, (part.name, label)))
         for part in parts(space)
@@ -301,15 +301,15 @@ def lower(space: Any, x: Any, change: Any) -> Array:
 
 
 def is_curved(space: Any) -> bool:
-    """Whether moving the mean changes the covariance, because a part of the space is curved."""
+    """Whether a change of the mean changes the covariance, because a part of the space is curved."""
     return any(part.manifold.curved for part in parts(space))
 
 
 def reset_jacobian(space: Any, delta: Array) -> Array:
-    """Derivative (n, n) of the error counted from ``retract(x, delta)`` by the one counted from ``x``.
+    """Jacobian (n, n) of the error reset: from errors about ``x`` to errors about ``retract(x, delta)``.
 
-    The error vector of an updated state is counted from its new mean; to first order it is
-    ``J(delta)`` times the old one (Sola, Deray, Atchuthan 2018, eq. 67 for rotations).
+    To first order the error about the updated mean is ``J(delta)`` times the error about the old one (Sola,
+    Deray, Atchuthan 2018, eq. 67 for rotations).
     """
     size = error_dim(space)
     rows = []
@@ -325,10 +325,10 @@ def reset_jacobian(space: Any, delta: Array) -> Array:
 
 
 def dtype_of(state: Any) -> Any:
-    """The floating-point type shared by the leaves of a state."""
+    """The common floating-point type of a state's leaves."""
     return jnp.result_type(*jax.tree.leaves(state))
 
 
 def copy_where(condition: Array, yes: Any, no: Any) -> Any:
-    """``yes`` where the scalar `condition` holds, else ``no``, leaf by leaf."""
+    """``yes`` if the scalar `condition` is true, else ``no``, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

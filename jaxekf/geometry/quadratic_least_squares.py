@@ -1,7 +1,8 @@
-"""Least squares on three unknowns whose residuals are quadratic, inside a scan and differentiable.
+"""Least squares with three unknowns and quadratic residuals, differentiable and usable inside a scan.
 
-Steps are solved by orthogonalisation, not by normal equations, whose squared condition number would
-cost half the digits on ill-placed sensors; all is unrolled arithmetic, without calls to LAPACK.
+Steps are solved by orthogonalisation. Normal equations would square the condition number and lose half
+the digits for badly placed sensors. All arithmetic is unrolled, without calls to LAPACK. `minimise` is the
+solver, `descend` the same without derivatives.
 """
 
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf.geometry.linalg import multiply
+from jaxekf.geometry.linalg import adjugate, multiply
 
 # A direction in which the Jacobian is below this part of its size counts as undetermined.
 WEAK = 1e-7
@@ -34,34 +35,35 @@ class Quadratic(NamedTuple):
 
     def residual(self, x: Array) -> Array:
         """Residuals (n,) at `x` (3,)."""
-        return self.constant + _times(self.linear + self.bent(x), x)
+        return self.constant + _times(self.linear + self.curved_times(x), x)
 
     def jacobian(self, x: Array) -> Array:
         """Derivative (n, 3) of the residuals at `x` (3,)."""
-        return self.linear + 2.0 * self.bent(x)
+        return self.linear + 2.0 * self.curved_times(x)
 
-    def bent(self, x: Array) -> Array:
+    def curved_times(self, x: Array) -> Array:
         """``curved @ x`` (n, 3)."""
         return jnp.sum(self.curved * x[None, None, :], axis=2)
 
 
 class Factors(NamedTuple):
-    """``matrix = basis @ inv(inverse)`` for a matrix (n, 3), by modified Gram-Schmidt."""
+    """QR factors ``matrix = basis @ inv(inverse)`` of a matrix (n, 3), by modified Gram-Schmidt."""
 
     basis: Array
-    """Orthonormal columns (n, 3); zero for a column that depends on those before it."""
+    """Orthonormal columns (n, 3); zero for a column that depends on the previous ones."""
     inverse: Array
-    """Inverse of the triangular factor (3, 3), without the columns that are not there."""
+    """Inverse of the triangular factor (3, 3), dependent columns left out."""
     large: Array
-    """The same with such columns as if they were just not there: what is unknown is large."""
+    """The same with dependent columns replaced by small ones, so that an undetermined direction is
+    large."""
     right: Array
-    """``basis' right`` (3,) of the right-hand side, as accurate as orthogonal factors give it."""
+    """``basis' right`` (3,) of the right-hand side, to the accuracy of the orthogonal factors."""
     weak: Array
-    """Whether some direction is undetermined, ()."""
+    """Whether a direction is undetermined, ()."""
 
 
 def _upper_inverse(r01: Array, r02: Array, r12: Array, diagonal: list[Array]) -> Array:
-    """Inverse (3, 3) of an upper triangular matrix, of which `diagonal` is already inverted."""
+    """Inverse (3, 3) of an upper triangular matrix whose `diagonal` is already inverted."""
     i, j, k = diagonal
     zero = jnp.zeros_like(i)
     u01, u12 = -i * r01 * j, -j * r12 * k
@@ -71,7 +73,7 @@ def _upper_inverse(r01: Array, r02: Array, r12: Array, diagonal: list[Array]) ->
 
 
 def orthogonalise(matrix: Array, right: Array) -> Factors:
-    """Factors of `matrix` (n, 3), with the right-hand side (n,); finite for any matrix."""
+    """Factors of `matrix` (n, 3) and the right-hand side (n,); finite for any matrix."""
     total = jnp.sum(lax.stop_gradient(matrix) ** 2)
     scale = jnp.sqrt(jnp.where(total > 0.0, total, 1.0))
     columns = [matrix[:, 0], matrix[:, 1], matrix[:, 2], right]
@@ -100,28 +102,26 @@ def orthogonalise(matrix: Array, right: Array) -> Factors:
     )
 
 
-def _inverse_near_one(matrix: Array) -> Array:
-    """Inverse (3, 3) by cofactors; the identity where there is none worth having."""
-    a, b, c = matrix
-    rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-    determinant = jnp.sum(a * rows[:, 0])
+def _inverse_or_identity(matrix: Array) -> Array:
+    """Inverse (3, 3) by cofactors; the identity if the matrix is nearly singular."""
+    rows, determinant = adjugate(matrix)
     good = jnp.abs(determinant) > 1e-9
     scaled = rows / jnp.where(good, determinant, 1.0)
     return jnp.where(good, scaled, jnp.eye(3, dtype=matrix.dtype))
 
 
-def _bend(problem: Quadratic, residual: Array, factors: Factors) -> Array:
-    """Inverse of the second derivative of half the cost, in the coordinates of `factors`, (3, 3).
+def _inverse_hessian(problem: Quadratic, residual: Array, factors: Factors) -> Array:
+    """Inverse Hessian (3, 3) of half the cost, in the coordinates of `factors`.
 
-    The identity where all residuals are zero.
+    It is the identity if all residuals are zero.
     """
     second = 2.0 * jnp.sum(residual[:, None, None] * problem.curved, axis=0)
     inside = multiply(multiply(factors.inverse.T, second), factors.inverse)
-    return _inverse_near_one(jnp.eye(3, dtype=second.dtype) + inside)
+    return _inverse_or_identity(jnp.eye(3, dtype=second.dtype) + inside)
 
 
 def _damped_step(problem: Quadratic, x: Array, damping: Array) -> Array:
-    """Levenberg and Marquardt's step (3,), `damping` relative to the size of the Jacobian."""
+    """Levenberg-Marquardt step (3,), `damping` relative to the size of the Jacobian."""
     jacobian = problem.jacobian(x)
     total = jnp.sum(jacobian * jacobian)
     weight = jnp.sqrt(damping * jnp.where(total > 0.0, total, 1.0))
@@ -132,12 +132,12 @@ def _damped_step(problem: Quadratic, x: Array, damping: Array) -> Array:
 
 
 def tolerance(x: Array) -> float:
-    """Steps shorter than this, relative, are the last: a further one leaves rounding only."""
+    """Relative step length at which the search has converged; a further step would be rounding."""
     return float(jnp.finfo(x.dtype).eps) ** 0.5
 
 
 def descend(problem: Quadratic, start: Array) -> tuple[Array, Array]:
-    """Damped steps from `start` (3,) until they are short, and whether they came to be; no derivatives."""
+    """Damped steps from `start` (3,), and whether they converged; without derivatives."""
     least = tolerance(start)
 
     def cost(x: Array) -> Array:
@@ -146,7 +146,7 @@ def descend(problem: Quadratic, start: Array) -> tuple[Array, Array]:
     def unfinished(carry: tuple[Array, Array, Array, Array, Array]) -> Array:
         return ~carry[3] & (carry[4] < _MOST_STEPS)
 
-    def go_on(
+    def advance(
         carry: tuple[Array, Array, Array, Array, Array],
     ) -> tuple[Array, Array, Array, Array, Array]:
         x, now, damping, _, count = carry
@@ -165,22 +165,36 @@ def descend(problem: Quadratic, start: Array) -> tuple[Array, Array]:
 
     first = jnp.asarray(1e-6, start.dtype)
     begin = (start, cost(start), first, jnp.asarray(False), jnp.asarray(0))
-    x, _, _, short, _ = lax.while_loop(unfinished, go_on, begin)
+    x, _, _, short, _ = lax.while_loop(unfinished, advance, begin)
     return x, short
 
 
 @jax.custom_jvp
 def minimise(problem: Quadratic, start: Array) -> tuple[Array, Array]:
-    """The minimum (3,) of the sum of squares that is reached from `start` (3,), and whether it is one.
+    """Minimum of the sum of squares that is reached from `start`.
 
-    Derivatives, forward and reverse and of any order, by the implicit function theorem; none by
-    `start`. What the residuals leave undetermined stays near `start`, and has derivative zero.
+    Derivatives of any order, forward and reverse, follow from the implicit function theorem; there is
+    none by `start`. A direction that the residuals do not determine stays near `start` and has
+    derivative zero.
+
+    Parameters
+    ----------
+    problem
+        Residuals.
+    start
+        (3,) initial value.
+
+    Returns
+    -------
+    The minimum (3,), and whether the search converged, ().
     """
     x, _ = descend(problem, start)
-    # Undamped and by the full second derivative: down to rounding, and an honest sign of convergence.
+    # Undamped and with the full Hessian: exact to rounding, and a reliable test of convergence.
     residual = problem.residual(x)
     factors = orthogonalise(problem.jacobian(x), residual)
-    step = -_times(factors.inverse, _times(_bend(problem, residual, factors), factors.right))
+    step = -_times(
+        factors.inverse, _times(_inverse_hessian(problem, residual, factors), factors.right)
+    )
     length = jnp.sqrt(jnp.sum(step * step)) / (1.0 + jnp.sum(jnp.abs(x)))
     x = jnp.where(length <= 1e4 * tolerance(x), x + step, x)
     return x, length <= tolerance(x)
@@ -196,5 +210,5 @@ def _minimise_jvp(
     residual = problem.residual(x)
     factors = orthogonalise(problem.jacobian(x), change.residual(x))
     towards = factors.right + _times(factors.inverse.T, _times(change.jacobian(x).T, residual))
-    moved = -_times(factors.inverse, _times(_bend(problem, residual, factors), towards))
+    moved = -_times(factors.inverse, _times(_inverse_hessian(problem, residual, factors), towards))
     return (x, converged), (moved, jnp.zeros(converged.shape, jax.dtypes.float0))  # pyright: ignore

@@ -19,12 +19,12 @@ from jax import Array
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 GROUP_CALLS: set[str] = set()
-"""Names, in a traced program, of the functions that `jaxekf.filtering.lowering.group_derivative` knows
-a derivative of."""
+"""Names, in a traced program, of the functions with a derivative in
+`jaxekf.filtering.lowering.group_derivative`."""
 
 
 def _group(function: _F) -> _F:
-    """The function as one operation of a traced program, recognisable by its name."""
+    """The function as one named operation of a traced program."""
     name = f"jaxekf.geometry.rotation.{function.__name__}"
     GROUP_CALLS.add(name)
 
@@ -61,8 +61,11 @@ _SMALL_TANGENT_SQUARED = 1e-3
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _polynomial(x: Array, coefficients: tuple[Any, ...]) -> Array:
-    """Horner evaluation of ``sum(c[i] * x**i)``; of several, with as many numbers in each ``c[i]``, on the
-    last axis, where `x` has one number."""
+    """Horner evaluation of ``sum(c[i] * x**i)``.
+
+    For several polynomials each ``c[i]`` has one coefficient for each on the last axis, where `x` has
+    size 1.
+    """
 
     def numbers(coefficient: Any) -> Array:
         value = jnp.asarray(coefficient, x.dtype)
@@ -128,18 +131,18 @@ def normalise(q: Array) -> Array:
 
 @_group
 def keep_unit(q: Array) -> Array:
-    """``q``, of unit norm but for rounding, scaled back to it: one Newton step, no division."""
+    """``q``, of unit norm but for rounding, normalised by one Newton step without a division."""
     return q * (1.5 - 0.5 * jnp.sum(q * q, axis=-1, keepdims=True))
 
 
 def pure(vector: Array) -> Array:
-    """The quaternion without real part, shapes (..., 3) to (..., 4)."""
+    """The quaternion with zero real part, shapes (..., 3) to (..., 4)."""
     return jnp.concatenate([jnp.zeros_like(vector[..., :1]), vector], axis=-1)
 
 
 @jax.custom_jvp
 def _reciprocal(x: Array) -> Array:
-    """``1 / x`` whose derivatives are products: on a CPU each division costs a kernel of its own."""
+    """``1 / x`` whose derivatives are products: on a CPU each division is a kernel of its own."""
     return 1.0 / x
 
 
@@ -152,9 +155,9 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
 def _half_angle(delta: Array) -> tuple[Array, Array]:
     """``cos(a / 2)`` and ``sin(a / 2) / a`` for ``a = |delta|``, shape (...).
 
-    Up to half a turn both are series in the square, which is smooth at zero too; beyond, whole turns are
-    taken off first. Many of these run side by side, where a processor has no sine of its own and the
-    mathematical library takes one at a time.
+    Up to half a turn both are series in the square, which is smooth at zero; beyond, whole turns are
+    subtracted first. Many of these are evaluated together, and a CPU has no vectorised sine of its
+    own.
     """
     square = 0.25 * jnp.sum(delta * delta, axis=-1)
     within = square < (0.5 * np.pi) ** 2
@@ -202,7 +205,7 @@ def log(q: Array) -> Array:
 
 @_group
 def rotate(q: Array, vector: Array) -> Array:
-    """``vector`` turned by ``q``: body coordinates to reference coordinates, shapes (..., 4), (..., 3)."""
+    """``vector`` rotated by ``q``, body to reference coordinates, shapes (..., 4), (..., 3) to (..., 3)."""
     imaginary = q[..., 1:]
     twice_cross = 2.0 * cross(imaginary, vector)
     return vector + q[..., :1] * twice_cross + cross(imaginary, twice_cross)
@@ -210,7 +213,7 @@ def rotate(q: Array, vector: Array) -> Array:
 
 @_group
 def rotate_inverse(q: Array, vector: Array) -> Array:
-    """``vector`` turned by the inverse of ``q``: reference coordinates to body coordinates."""
+    """``vector`` rotated by the inverse of ``q``, reference to body coordinates."""
     return rotate(conjugate(q), vector)
 
 
@@ -227,9 +230,9 @@ def to_matrix(q: Array) -> Array:
 def from_matrix(matrix: Array) -> Array:
     """Quaternion with ``w >= 0`` of the rotation matrix ``R``, shapes (..., 3, 3) to (..., 4).
 
-    Shepperd's way: the entries of ``R`` give ``4 q q'``, of which the row of the largest component is
-    taken, so that nothing small is divided by, at half a turn either. What `matrix` holds beside a
-    rotation, rounding for instance, is not looked for.
+    Shepperd's method: the entries of ``R`` give ``4 q q'``, and the row of the largest component is
+    used, so that no small number is a divisor, not even at 180 degrees. `matrix` is not checked for
+    being a rotation.
     """
     (a, b, c), (d, e, f), (g, h, i) = (tuple(matrix[..., j, k] for k in range(3)) for j in range(3))
     rows = [

@@ -1,17 +1,17 @@
-"""Attitude from two directions known in two frames, as gravity and the magnetic field are: TRIAD.
+"""Attitude from two directions known in two frames, such as gravity and the magnetic field: TRIAD.
 
-It is that of Ang, Khosla and Riviere, eqs. 7 to 13, its covariance their eqs. 41 to 46. For more than two
-directions, or two that are equally trusted, see `wahba`.
+The algorithm is that of Ang, Khosla and Riviere, eqs. 7 to 13, the covariance their eqs. 41 to 46. For more
+directions, or two that are equally certain, see `wahba`.
 
-What is wrong in the paper's print, and done otherwise here:
+Corrections of the paper's print:
 
-- Eq. 38 with eq. 13 gives the conjugate of the quaternion from body to world, divides by its real part,
-  which fails at half a turn, and flips in sign. See `rotation.from_matrix` and the argument `near`.
-- The vector of eq. 10 is what an accelerometer reads: specific force, **up** at rest. With gravity in
-  its place the answer is half a turn off.
+- Eq. 38 with eq. 13 gives the conjugate of the body-to-world quaternion, divides by its real part, which
+  fails at 180 degrees, and is ambiguous in sign. See `rotation.from_matrix` and the argument `near`.
+- The vector of eq. 10 is the reading of an accelerometer: specific force, **up** at rest. Gravity in its
+  place would give an error of 180 degrees.
 - The world of the paper is magnetic north, west, up; see `north_west_up`.
 - The product of eq. 45 is a dot product; its error is a rotation vector in the body frame. The 4 by 4
-  covariance of eq. 46 has rank 3, so that the error of three components is given here.
+  covariance of eq. 46 has rank 3, so the error here has three components.
 
 Every function is for one attitude; use ``jax.vmap`` for many. Derivatives are finite everywhere, and
 zero where `Attitude.valid` is False.
@@ -26,20 +26,20 @@ from jaxekf.geometry import linalg, rotation
 
 
 class Attitude(NamedTuple):
-    """An attitude, and whether the vectors told it."""
+    """An attitude, and whether the vectors determine it."""
 
     q_ref_body: Array
     """(4,) unit quaternion w, x, y, z that takes body coordinates to reference coordinates."""
     valid: Array
-    """() False where the vectors leave a turn open or are not finite; the quaternion is then the
+    """() False if the vectors leave a rotation undetermined or are not finite; the quaternion is then the
     fallback."""
 
 
 class References(NamedTuple):
-    """Unit vectors of the world that an accelerometer at rest and a magnetometer measure."""
+    """Reference directions: unit vectors that an accelerometer at rest and a magnetometer measure."""
 
     up: Array
-    """(3,) direction of specific force at rest: against gravity."""
+    """(3,) direction of specific force at rest, opposite to gravity."""
     field: Array
     """(3,) direction of the Earth's magnetic field."""
 
@@ -47,7 +47,10 @@ class References(NamedTuple):
 def north_west_up(dip: Array | float) -> References:
     """References in the world of the paper: x to magnetic north, y west, z up.
 
-    `dip`, radians, is the angle of the field below the horizontal, positive on the northern half.
+    Parameters
+    ----------
+    dip
+        Angle of the field below the horizontal, rad, positive in the northern hemisphere.
     """
     dip = jnp.asarray(dip, float)
     zero, one = jnp.zeros_like(dip), jnp.ones_like(dip)
@@ -55,10 +58,14 @@ def north_west_up(dip: Array | float) -> References:
 
 
 def east_north_up(dip: Array | float, declination: Array | float = 0.0) -> References:
-    """References where x points east, y north, z up.
+    """References with x pointing east, y north, z up.
 
-    `dip` as for `north_west_up`. `declination`, radians, is the angle from true to magnetic north,
-    positive to the east; with 0 north is magnetic north.
+    Parameters
+    ----------
+    dip
+        As in `north_west_up`, rad.
+    declination
+        Angle from true to magnetic north, rad, positive to the east; 0 for magnetic north.
     """
     dip, declination = jnp.asarray(dip, float), jnp.asarray(declination, float)
     zero, one = jnp.zeros_like(dip), jnp.ones_like(dip)
@@ -77,22 +84,31 @@ def triad(
     fallback: Array | None = None,
     least_sine: Array | float | None = None,
 ) -> Attitude:
-    """Attitude from two vectors measured in the body and known in the reference (eqs. 7 to 13).
+    """Attitude from two vectors measured in the body frame and known in the reference frame (eqs. 7 to 13).
 
-    The direction of the first is met exactly; of the second only the half-plane which it spans with
-    the first. With ``*north_west_up(dip)`` as the last two, the first is the accelerometer's, the second
-    the magnetometer's reading, and the dip angle does not matter.
+    The direction of the first vector is matched exactly; of the second only the half-plane that it
+    spans with the first. With ``*north_west_up(dip)`` as references, the first is the accelerometer's
+    and the second the magnetometer's reading, and the result does not depend on the dip.
 
-    All vectors are (3,), of any length and unit. The sign of the quaternion is that nearer to `near`
-    (4,), else the real part is not negative. Where a vector is zero or not finite, or the sine of
-    the angle between the two of a pair is not above `least_sine` (by default the square root of the
-    rounding error), `fallback` (4,) is returned, by default the identity.
+    Parameters
+    ----------
+    first_body, second_body
+        (3,) measured vectors, body frame, any length and unit.
+    first_ref, second_ref
+        (3,) the same vectors in the reference frame.
+    near
+        (4,) quaternion that selects the sign of the result; without it the real part is not negative.
+    fallback
+        (4,) result for invalid vectors, by default the identity.
+    least_sine
+        Smallest sine of the angle between two vectors of a pair; by default the square root of the rounding
+        error.
     """
-    body, body_told = _triad_axes(first_body, second_body, least_sine)
-    reference, reference_told = _triad_axes(first_ref, second_ref, least_sine)
+    body, body_valid = _triad_axes(first_body, second_body, least_sine)
+    reference, reference_valid = _triad_axes(first_ref, second_ref, least_sine)
     matrix = sum(r[:, None] * b[None, :] for r, b in zip(reference, body, strict=True))
     return attitude_or(
-        rotation.from_matrix(jnp.asarray(matrix)), body_told & reference_told, near, fallback
+        rotation.from_matrix(jnp.asarray(matrix)), body_valid & reference_valid, near, fallback
     )
 
 
@@ -106,18 +122,33 @@ def triad_covariance(
 ) -> Array:
     """Covariance (3, 3), rad^2, of the attitude error of `triad` (eqs. 41 to 46), to first order.
 
-    The error is a rotation vector in the body frame: ``estimate = truth * exp(error)``. `first_cov` and
-    `second_cov` (3, 3) are covariances of the two body vectors, in their own units squared, of any
-    shape, independent of one another. Errors of the references count as well when their covariances,
-    turned to the body frame and scaled to the length of the body vectors, are added to these.
+    The error is a rotation vector in the body frame: ``estimate = truth * exp(error)``. With axes ``t1``
+    along the first vector ``a``, ``t2`` along ``a x b`` and ``t3 = t1 x t2``, changes ``da`` and ``db`` of
+    the vectors rotate the axes by
 
-    With axes ``t1`` along the first vector ``a``, ``t2`` along ``a x b`` and ``t3 = t1 x t2``, the axes
-    turn by ``phi = t1 x da/|a| + t1 (t2.db - (b.t1) t2.da/|a|) / |t1 x b|`` when the vectors change by
-    ``da`` and ``db``: their first part keeps ``t1`` on ``a``, the second keeps ``b`` in the plane of
-    ``t1`` and ``t3``. The attitude turns by ``-phi``.
+        phi = t1 x da/|a| + t1 (t2.db - (b.t1) t2.da/|a|) / |t1 x b|
 
-    Where `triad` is not valid for the sake of the body vectors, the identity is returned: about one
-    radian, which is nothing known. The references are not looked at.
+    The first part keeps ``t1`` on ``a``, the second keeps ``b`` in the plane of ``t1`` and ``t3``. The
+    attitude rotates by ``-phi``.
+
+    Parameters
+    ----------
+    first_body, second_body
+        (3,) measured vectors, body frame.
+    first_cov, second_cov
+        (3, 3) their covariances, in their own units squared, independent of each other. To include errors
+        of the references, add their covariances, rotated to the body frame and scaled to the body vectors.
+    least_sine
+        As in `triad`.
+
+    Returns
+    -------
+    (3, 3); the identity, a standard deviation of one radian, if the body vectors leave the attitude open.
+
+    Raises
+    ------
+    ValueError
+        For a covariance of another shape.
     """
     for cov in (first_cov, second_cov):
         # Anything else would be broadcast, to what is no covariance.
@@ -127,37 +158,37 @@ def triad_covariance(
                 " is sigma**2 * jnp.eye(3), and for many attitudes use jax.vmap"
             )
     dtype = float_type(first_body, second_body, first_cov, second_cov)
-    (t1, t2, t3), told = _triad_axes(first_body, second_body, least_sine)
-    first = jnp.where(told, jnp.asarray(first_body, dtype), t1)
-    second = jnp.where(told, jnp.asarray(second_body, dtype), -t3)
+    (t1, t2, t3), valid = _triad_axes(first_body, second_body, least_sine)
+    first = jnp.where(valid, jnp.asarray(first_body, dtype), t1)
+    second = jnp.where(valid, jnp.asarray(second_body, dtype), -t3)
     length, along, across = jnp.sum(first * t1), jnp.sum(second * t1), -jnp.sum(second * t3)
     about_first = t1[:, None] * t2[None, :] / across
     by_first = (rotation.skew(t1) - along * about_first) / length
     # A reading that is not used may come with any covariance, NaN as well.
     noise = [
-        jnp.where(told, jnp.asarray(cov, dtype), jnp.eye(3, dtype=dtype))
+        jnp.where(valid, jnp.asarray(cov, dtype), jnp.eye(3, dtype=dtype))
         for cov in (first_cov, second_cov)
     ]
     total = linalg.congruence(by_first, noise[0]) + linalg.congruence(about_first, noise[1])
-    return jnp.where(told, total, jnp.eye(3, dtype=dtype))
+    return jnp.where(valid, total, jnp.eye(3, dtype=dtype))
 
 
 def float_type(*arrays: Array) -> jnp.dtype:
-    """The floating-point type in which to work on `arrays`."""
+    """Floating-point type for computations on `arrays`."""
     dtype = jnp.result_type(*arrays)
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
-def least_told(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
-    """`least`, or the square root of the rounding error: half of all digits are left there."""
+def default_threshold(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
+    """`least`, or by default the square root of the rounding error, at which half the digits remain."""
     return float(jnp.finfo(dtype).eps) ** 0.5 if least is None else least
 
 
 def directions(vector: Array) -> tuple[Array, Array]:
-    """Unit vectors (..., 3) and whether each could be made; x where it could not.
+    """Unit vectors (..., 3), and whether each could be normalised; x if not.
 
-    The largest component is divided out first, so that squares neither overflow nor vanish. The
-    result does not depend on that factor, so it may count as a constant under differentiation.
+    The largest component is divided out first, so that squares neither overflow nor underflow. The
+    result does not depend on that factor, which is therefore a constant under differentiation.
     """
     largest = lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
     # A comparison with NaN is False.
@@ -168,7 +199,7 @@ def directions(vector: Array) -> tuple[Array, Array]:
 
 
 def attitude_or(q: Array, valid: Array, near: Array | None, fallback: Array | None) -> Attitude:
-    """``q`` with the sign nearer to `near` where `valid`, else `fallback` or the identity."""
+    """``q`` with the sign nearer to `near` if `valid`, else `fallback` or the identity."""
     if near is not None:
         q = rotation.align(q, jnp.asarray(near, q.dtype))
     other = rotation.identity() if fallback is None else fallback
@@ -178,13 +209,15 @@ def attitude_or(q: Array, valid: Array, near: Array | None, fallback: Array | No
 def _triad_axes(
     first: Array, second: Array, least_sine: Array | float | None
 ) -> tuple[tuple[Array, Array, Array], Array]:
-    """The axes along `first`, across both, and their product; and whether the pair tells them."""
+    """Axes along `first`, the cross product and their product, and whether the pair determines them."""
     dtype = float_type(first, second)
     first, first_usable = directions(jnp.asarray(first, dtype))
     second, second_usable = directions(jnp.asarray(second, dtype))
     squared_sine = jnp.sum(jnp.cross(first, second) ** 2)
-    told = first_usable & second_usable & (squared_sine > least_told(least_sine, dtype) ** 2)
+    valid = (
+        first_usable & second_usable & (squared_sine > default_threshold(least_sine, dtype) ** 2)
+    )
     eye = jnp.eye(3, dtype=dtype)
-    first, second = jnp.where(told, first, eye[0]), jnp.where(told, second, eye[1])
+    first, second = jnp.where(valid, first, eye[0]), jnp.where(valid, second, eye[1])
     normal = rotation.normalise(jnp.cross(first, second))
-    return (first, normal, jnp.cross(first, normal)), told
+    return (first, normal, jnp.cross(first, normal)), valid

@@ -1,18 +1,18 @@
 """The scaled unscented transform: mean and covariance of a function of a random vector.
 
-Instead of a derivative, the function is taken at ``2 n + 1`` points: the mean and, along each column of a
-factor of the covariance, a step of ``sqrt(n + lambda)`` either way, ``lambda = alpha^2 (n + kappa) - n``.
-Means of quadratic functions are exact, where the derivative sees only the linear part.
+The function is evaluated at ``2 n + 1`` points: the mean and, along each column of a factor of the
+covariance, a step of ``sqrt(n + lambda)`` in both directions, ``lambda = alpha^2 (n + kappa) - n``. Means
+of quadratic functions are exact, whereas a linearisation uses the linear part only.
 
-Ang, Khosla and Riviere find the covariance of an angular velocity so (eqs. 34 to 37), from acceleration
-differences whose covariance is that of eq. 32. What is wrong in print: what eqs. 34 and 35 give is the
-plain transform, not the scaled one, with the weight of the mean ``c_0 = kappa / (n + kappa)`` (``S_0`` is
-the point at distance 0, the measured differences themselves) and all others ``1 / (2 (n + kappa))``. It is
-the case ``alpha = 1, beta = 0`` here, the default, and with ``n = 3`` the usual ``kappa = 3 - n`` is 0. In
-eq. 32 the difference of two independent readings has twice the variance of one, not four times.
+Ang, Khosla and Riviere compute the covariance of an angular velocity in this way (eqs. 34 to 37), from
+acceleration differences whose covariance is that of eq. 32. Corrections of the print: eqs. 34 and 35 give
+the plain transform, not the scaled one, with the weight of the mean ``c_0 = kappa / (n + kappa)`` (``S_0``
+is the point at distance 0, the measured differences) and all others ``1 / (2 (n + kappa))``. That is the
+default here, ``alpha = 1, beta = 0``, and with ``n = 3`` the usual ``kappa = 3 - n`` is 0. In eq. 32 the
+difference of two independent readings has twice the variance of one, not four times.
 
 Covariances may be semidefinite. Derivatives with respect to mean and covariance are finite everywhere; a
-direction without variance takes no part, and a variance of 0 gets no gradient.
+direction without variance is left out, and a zero variance has zero gradient.
 """
 
 from collections.abc import Callable
@@ -26,14 +26,14 @@ from jaxekf.geometry import linalg, manifold
 
 
 class Moments(NamedTuple):
-    """What the transform finds."""
+    """Result of the transform."""
 
     mean: Any
-    """(m,); of `transform_on` a point of the output's space."""
+    """(m,); for `transform_on` a point of the output's space."""
     cov: Array
     """(m, m) covariance of the output, or of its error vector at `mean`."""
     cross: Array
-    """(n, m) covariance of the input, or of its error vector, with the output's."""
+    """(n, m) cross-covariance of the input, or of its error vector, with the output."""
 
 
 def transform(
@@ -45,21 +45,38 @@ def transform(
     beta: float = 0.0,
     kappa: float = 0.0,
 ) -> Moments:
-    """Mean, covariance and cross-covariance of ``fn(x)``, x of `mean` (n,) and `cov` (n, n).
+    """Mean, covariance and cross-covariance of ``fn(x)`` for a random vector ``x``.
 
-    `fn` takes (n,) to (m,). `alpha` > 0 scales the distance of the points from the mean; `beta` adds
-    to the weight of the mean in the covariance, 2 being best for a Gaussian; `kappa` > -n sets the
-    distance too. The weights are
+    The weights of the points are
 
         mean          lambda / (n + lambda)
         covariance    lambda / (n + lambda) + 1 - alpha^2 + beta     of the point at the mean
         both          1 / (2 (n + lambda))                          of every other point
 
-    With ``n + lambda = 3`` the fourth moments along the axes are those of a Gaussian. ``beta >= alpha^2``,
-    or ``kappa >= 0`` with ``alpha = 1``, keep the covariance from becoming indefinite. Small `alpha` costs
-    no digits but those of the differences of `fn` themselves. A `cov` that is not semidefinite gives NaN.
+    With ``n + lambda = 3`` the fourth moments along the axes are those of a Gaussian. The covariance is
+    positive semidefinite for ``beta >= alpha^2``, or ``kappa >= 0`` with ``alpha = 1``. A small `alpha`
+    costs no digits but those of the differences of `fn` themselves. A `cov` that is not semidefinite
+    gives NaN.
 
-    Raises ValueError when ``alpha^2 (n + kappa)`` is not positive or shapes do not fit.
+    Parameters
+    ----------
+    fn
+        Takes (n,) to (m,).
+    mean
+        (n,) mean of ``x``.
+    cov
+        (n, n) covariance of ``x``.
+    alpha
+        Positive scale of the distance of the points from the mean.
+    beta
+        Added weight of the mean in the covariance; 2 is best for a Gaussian.
+    kappa
+        Second parameter of the distance, above -n.
+
+    Raises
+    ------
+    ValueError
+        If ``alpha^2 (n + kappa)`` is not positive, or if the shapes do not match.
     """
     mean, cov = jnp.asarray(mean), jnp.asarray(cov)
     size = mean.shape[0] if mean.ndim == 1 else -1
@@ -103,14 +120,24 @@ def transform_on(
     beta: float = 0.0,
     kappa: float = 0.0,
 ) -> Moments:
-    """`transform` where input or output lie on manifolds, as an attitude does.
+    """The same as `transform` for an input or output on manifolds, such as an attitude.
 
-    `space` and `output_space` are manifolds or NamedTuples of manifolds (`jaxekf.geometry.manifold`);
-    `mean` is a point of the first, `cov` (n, n) the covariance of its error vector, and `fn` takes
-    points of the first to points of the second. Of the output, errors are counted from ``fn(mean)``,
-    the mean is that point moved by their mean, and the covariance is turned to the new mean by the
-    derivative of the change of origin. That agrees with the mean on the manifold to the order of the
-    transform.
+    Errors of the output are relative to ``fn(mean)``; the mean is that point moved by their mean, and the
+    covariance is transformed to the new mean by the reset Jacobian. The result agrees with the mean on the
+    manifold to the order of the transform.
+
+    Parameters
+    ----------
+    fn
+        Takes points of `space` to points of `output_space`.
+    mean
+        Point of `space`.
+    cov
+        (n, n) covariance of its error vector.
+    space, output_space
+        Manifolds or NamedTuples of manifolds (`jaxekf.geometry.manifold`).
+    alpha, beta, kappa
+        As in `transform`.
     """
     centre = fn(mean)
 

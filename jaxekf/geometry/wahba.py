@@ -1,14 +1,15 @@
-"""Attitude from many directions known in two frames: Davenport's answer to Wahba's problem.
+"""Attitude from many directions known in two frames: Davenport's solution of Wahba's problem.
 
 The covariance is Shuster's for QUEST, which solves the same problem. Every function is for one attitude;
 use ``jax.vmap`` for many. Derivatives are finite everywhere, and zero where `Attitude.valid` is False.
+`host_rotation.nearest_rotation` solves the same problem in NumPy.
 """
 
 import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxekf.geometry import linalg, rotation
-from jaxekf.geometry.triad import Attitude, attitude_or, directions, float_type, least_told
+from jaxekf.geometry.triad import Attitude, attitude_or, default_threshold, directions, float_type
 
 
 def q_method(
@@ -20,28 +21,34 @@ def q_method(
     fallback: Array | None = None,
     least_gap: Array | float | None = None,
 ) -> Attitude:
-    """Attitude that turns many directions best: Davenport's q-method.
+    """Least-squares attitude from directions: Davenport's q-method.
 
-    It is the largest of ``sum(weight * reference . (R @ body))`` over unit vectors: with weights of
-    one over the variance (rad^2) of each direction, the most likely one. `body` and `reference` are
-    (n, 3), n >= 2, of any length; `weights` (n,), equal by default. Zero and non-finite vectors, and
-    those of weight 0, take no part.
+    It maximises ``sum(weight * reference . (R @ body))`` over unit vectors. With weights of one over
+    the variance (rad^2) of each direction this is the maximum-likelihood attitude. The solution is
+    the eigenvector of the largest eigenvalue of a symmetric 4 by 4 matrix. First and second
+    derivatives are those of the optimum, not of the unused eigenvectors.
 
-    The answer is the eigenvector of the largest eigenvalue of a symmetric 4 by 4 matrix. Where the next
-    eigenvalue is within `least_gap` of it, as a share of all weight, a turn is left open (all
-    directions on one line, or contradictions) and `fallback` (4,) is returned, by default the
-    identity. The default gap is the square root of the rounding error. For the sign see `vectors.triad`.
-
-    First and second derivatives are those of the optimum, not of the eigenvectors that go unused.
+    Parameters
+    ----------
+    body, reference
+        (n, 3) vectors, n >= 2, any length; zero and non-finite ones are ignored.
+    weights
+        (n,), equal by default; a direction of weight 0 is ignored.
+    near, fallback
+        As in `triad.triad`.
+    least_gap
+        Smallest gap between the two largest eigenvalues, as a share of the total weight, by default
+        the square root of the rounding error. A smaller gap leaves a rotation undetermined (collinear
+        or contradictory directions), and the result is `fallback`.
     """
     b, r, share = _pairs(body, reference, weights)
     profile = jnp.sum(share[:, None, None] * r[:, :, None] * b[:, None, :], axis=0)
     values, columns = jnp.linalg.eigh(lax.stop_gradient(_davenport(profile)))
-    told = values[3] - values[2] > least_told(least_gap, profile.dtype)
-    q = jnp.where(told, columns[:, 3], rotation.identity().astype(profile.dtype))
-    profile = jnp.where(told, profile, jnp.eye(3, dtype=profile.dtype))
+    valid = values[3] - values[2] > default_threshold(least_gap, profile.dtype)
+    q = jnp.where(valid, columns[:, 3], rotation.identity().astype(profile.dtype))
+    profile = jnp.where(valid, profile, jnp.eye(3, dtype=profile.dtype))
     q = _with_derivatives(q, profile)
-    return attitude_or(jnp.where(q[:1] < 0.0, -q, q), told, near, fallback)
+    return attitude_or(jnp.where(q[:1] < 0.0, -q, q), valid, near, fallback)
 
 
 def q_method_covariance(
@@ -53,14 +60,26 @@ def q_method_covariance(
 ) -> Array:
     """Covariance (3, 3), rad^2, of the attitude error of `q_method`, to first order.
 
-    The error is a rotation vector in the body frame. `body` (n, 3) are the measured vectors, of any
-    length; `deviations` (n,), radians, the standard deviation of each direction across itself, the
-    same both ways, body and reference taken together (the root of the sum of squares); a direction whose
-    deviation is not positive and finite takes no part. With weights
-    of one over their squares, the default, this is Shuster's ``inv(sum((I - b b') / deviation^2))``;
-    any other `weights` (n,), positive, give the covariance of the estimate which they make.
+    The error is a rotation vector in the body frame. With weights of one over the squared deviations,
+    the default, this is Shuster's ``inv(sum((I - b b') / deviation^2))``; any other weights give the
+    covariance of the estimate with these weights.
 
-    Where a turn is left open the identity is returned: about one radian, which is nothing known.
+    Parameters
+    ----------
+    body
+        (n, 3) measured vectors, any length.
+    deviations
+        (n,) rad, standard deviation of each direction perpendicular to itself, isotropic, body and
+        reference combined (root of the sum of squares). A direction with a deviation that is not
+        positive and finite is ignored.
+    weights
+        (n,), positive.
+    least_gap
+        As in `q_method`.
+
+    Returns
+    -------
+    (3, 3); the identity, a standard deviation of one radian, if a rotation is undetermined.
     """
     deviations = jnp.asarray(deviations, float_type(body, deviations))
     positive = (deviations > 0.0) & jnp.isfinite(deviations)
@@ -72,13 +91,13 @@ def q_method_covariance(
     noise = jnp.sum((share * share * variances)[:, None, None] * across, axis=0)
     # Its eigenvalues add up to 2 and none exceeds 1: the determinant is about the smallest, which is
     # half the gap of `q_method`.
-    told = 2.0 * _determinant(information) > least_told(least_gap, b.dtype)
-    inverse = _inverse(jnp.where(told, information, jnp.eye(3, dtype=b.dtype)))
-    return jnp.where(told, linalg.congruence(inverse, noise), jnp.eye(3, dtype=b.dtype))
+    valid = 2.0 * linalg.adjugate(information)[1] > default_threshold(least_gap, b.dtype)
+    inverse = _inverse(jnp.where(valid, information, jnp.eye(3, dtype=b.dtype)))
+    return jnp.where(valid, linalg.congruence(inverse, noise), jnp.eye(3, dtype=b.dtype))
 
 
 def _pairs(body: Array, reference: Array, weights: Array | None) -> tuple[Array, Array, Array]:
-    """Unit vectors (n, 3) of both frames, and the share (n,) of each pair in all weight."""
+    """Unit vectors (n, 3) of both frames, and the relative weight (n,) of each pair."""
     dtype = float_type(body, reference)
     body, reference = jnp.asarray(body, dtype), jnp.asarray(reference, dtype)
     if body.ndim != 2 or body.shape[1] != 3 or body.shape != reference.shape:
@@ -119,33 +138,28 @@ def _axial(profile: Array) -> Array:
 
 
 def _with_derivatives(q: Array, profile: Array) -> Array:
-    """``q``, a constant, as a function of the `profile` for which it is the answer.
+    """``q``, a constant, as a function of the `profile` that it solves.
 
-    Turned by a rotation vector ``d``, with ``S = R' profile``, the sum which is to be the largest grows
-    by ``d . axial(S) - d' M d / 2``, ``M`` being ``trace(S) I`` less the symmetric part of ``S``. Steps
-    ``inv(M) axial(S)`` change the value by rounding only. Where `profile` changes by a little, q being
-    constant, each brings the answer right to one more order in that, with ``M`` constant as well: two
-    steps give first and second derivatives.
+    For a rotation by ``d``, with ``S = R' profile``, the objective grows by
+
+        d . axial(S) - d' M d / 2
+
+    with ``M`` being ``trace(S) I`` minus the symmetric part of ``S``. Steps ``inv(M) axial(S)`` change the
+    value by rounding only. For a small change of `profile` with constant q, each step makes the solution
+    right to one more order in that change, with ``M`` constant as well: two steps give first and second
+    derivatives.
     """
     now = linalg.multiply(rotation.to_matrix(q).T, lax.stop_gradient(profile))
     curvature = jnp.trace(now) * jnp.eye(3, dtype=q.dtype) - linalg.symmetrise(now)
     inverse = _inverse(curvature)
     for _ in range(2):
-        turned = linalg.multiply(rotation.to_matrix(q).T, profile)
-        half_step = 0.5 * jnp.sum(inverse * _axial(turned)[None, :], axis=1)
+        rotated = linalg.multiply(rotation.to_matrix(q).T, profile)
+        half_step = 0.5 * jnp.sum(inverse * _axial(rotated)[None, :], axis=1)
         q = rotation.normalise(q + rotation.product(q, rotation.pure(half_step)))
     return q
 
 
-def _cofactors(matrix: Array) -> Array:
-    a, b, c = matrix
-    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-
-
-def _determinant(matrix: Array) -> Array:
-    return jnp.sum(matrix[0] * _cofactors(matrix)[0])
-
-
 def _inverse(matrix: Array) -> Array:
     """Inverse (3, 3), without a call to LAPACK."""
-    return _cofactors(matrix).T / _determinant(matrix)
+    adjugate, determinant = linalg.adjugate(matrix)
+    return adjugate / determinant

@@ -1,4 +1,9 @@
-"""The models that come with the package, by name. Adding one is a file here and a line below."""
+"""The models that come with the package, by name.
+
+Choose `loose` for a tracker that reports attitudes, `loose_pose` for one that reports poses, `tight` for
+single markers, `visual` for landmarks in images, and `marg` without a tracker; each module begins with its
+states, sensors, parameters and source. A new model is a file here and a line below.
+"""
 
 import importlib
 import os
@@ -36,15 +41,23 @@ REGISTRY: dict[str, Model] = {
 
 
 def adapted(model: Model, recordings: Sequence[Recording]) -> Model:
-    """The model as these recordings need it."""
+    """The model as these recordings need it, with a sensor for each marker for instance."""
     return model if model.adapt is None else model.adapt(recordings)
 
 
 def get_model(model: str | Model) -> Model:
-    """A model by its name, by ``module:attribute``, or itself.
+    """A model by name.
 
-    ``module`` is imported as Python would from the current directory. Raises `ModelError` where there
-    is no such model.
+    Parameters
+    ----------
+    model
+        Name of a model here, ``module:attribute`` of a model elsewhere (imported as from the current
+        directory), or a `Model`.
+
+    Raises
+    ------
+    ModelError
+        If there is no such model.
     """
     if isinstance(model, Model):
         return model
@@ -63,7 +76,7 @@ def get_model(model: str | Model) -> Model:
     except Exception as error:  # a user's module may raise anything while it is imported
         raise ModelError(
             f"got the model '{model}', expected an importable module with that attribute"
-            f" ({type(error).__name__}: {error}); check the name, the folder you are in, and the module"
+            f" ({type(error).__name__}: {error}); check the name, the current directory, and the module"
         ) from error
     if not isinstance(found, Model):
         raise ModelError(

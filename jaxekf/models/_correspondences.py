@@ -1,4 +1,4 @@
-"""What a camera's images tell the model `visual`: its samples, and where a run starts from."""
+"""Samples and start of the model `visual` from a camera's images."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,45 +25,45 @@ from jaxekf.recordings.types import (
 
 _LINE_S = 0.35
 _NEAR_S = 0.1
-"""An IMU sample so near to the first image tells acceleration and rate there."""
+"""Largest time, s, between the first image and the IMU sample that gives acceleration and rate there."""
 START_POSITION, START_ATTITUDE = 0.05, float(np.deg2rad(1.0))
-"""Standard deviations, metres and radians, of a pose that a run starts from."""
+"""Standard deviations, metres and radians, of the initial pose."""
 _PIXEL = 1.0
-"""Noise of image points that is expected at least when a pose is chosen to start from."""
+"""Noise of image points that is assumed at least when an initial pose is chosen."""
 _GOOD = 1.5
-"""Times as uncertain as that a pose may be: eight points tell most poses so well, four next to none. Where
-no pose is known so well, times as uncertain as the best."""
+"""Largest uncertainty of an initial pose in units of these deviations: eight points usually reach it, four
+rarely do. If no pose reaches it, the bound is relative to the best pose."""
 _PATIENCE_S = 5.0
-"""The time after which twice that will do, and so on, as what goes before the start is lost. Of images of
-fewer than `_SURE` points no less will do, since they fit poses far off by chance."""
+"""Seconds after which twice that uncertainty is accepted, and so on, since samples before the start are
+lost. Images with fewer than `_SURE` points always need the strict bound, as they may fit a wrong pose
+by chance."""
 _SURE = pnp.FEWEST
 _FIRST = 16
-"""Images that are solved for at first to find a start."""
+"""Images that are solved first in the search for a start."""
 
 
 class Point(NamedTuple):
-    """Of one correspondence: its landmark, and how well the image point is known."""
+    """Data of one correspondence: its landmark and the reported noise."""
 
     p_ref_landmark: Any
     """(3,) metres."""
     sigma: Any
-    """Reported standard deviation, pixels; 0 where none was reported; ()."""
+    """Reported standard deviation, pixels; 0 if none was reported; ()."""
 
 
-class SeenPoint(NamedTuple):
-    """The same where the image point goes into the slope."""
+class BilinearPoint(NamedTuple):
+    """The same for the bilinear form, in which the image point enters the slope."""
 
     p_ref_landmark: Any
     sigma: Any
     pixel: Any
     """(2,) the image point."""
     depth: Any
-    """Metres along the optical axis, from the pose of the image alone; ()."""
+    """Depth along the optical axis, m, from the single-image pose; ()."""
 
 
 def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
-    """The image points (N, 2 count) of up to `count` landmarks of each image, the first of them in the
-    order of the landmarks; of the bilinear form zeros."""
+    """Image points (N, 2 count) of the first `count` visible landmarks; zeros in the bilinear form."""
     stream = recording.need_camera()
     usable = stream.usable
     # The landmarks that are seen, in order, then others to fill up.
@@ -76,12 +76,12 @@ def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
     if stream.sigma is not None:
         sigma = np.nan_to_num(np.where(mask, stream.sigma[here, order], 0.0))
     place = stream.p_ref_landmark[order]
-    place, sigma, value = (_filled(a, short) for a in (place, sigma, pixel))
+    place, sigma, value = (_padded(a, short) for a in (place, sigma, pixel))
     aux: Any = Point(place, sigma)
     if bilinear:
-        aux = SeenPoint(place, sigma, value, _depth(stream, place, recording))
+        aux = BilinearPoint(place, sigma, value, _depth(stream, place, recording))
         value = np.zeros_like(value)
-    rows = np.repeat(_filled(mask, short), 2, axis=1)
+    rows = np.repeat(_padded(mask, short), 2, axis=1)
     taken = stream.time_ns - stream.latency_ns
     flat = value.reshape(len(value), 2 * count)
     there = stream.visible.sum(axis=1)
@@ -89,14 +89,13 @@ def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
     return Samples(taken, flat, rows, aux, *known, points=there, copies=count)
 
 
-def _filled(values: Any, short: int) -> Any:
-    """So many more groups (axis 1), copies of the first."""
+def _padded(values: Any, short: int) -> Any:
+    """Arrays with `short` more groups (axis 1), copies of the first."""
     return np.concatenate([values, np.repeat(values[:, :1], short, axis=1)], axis=1)
 
 
 def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
-    """Depths (N, M), metres, of landmarks (N, M, 3) from the poses of the images alone, those of the
-    nearest image that has one."""
+    """Depths (N, M), m, of landmarks (N, M, 3), from the pose of the nearest image that has one."""
     found = pnp.poses(stream)
     known = np.flatnonzero(found.valid)
     if known.size == 0:
@@ -118,7 +117,7 @@ def _depth(stream: Camera, place: Any, recording: Recording) -> Any:
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first image from which a pose follows, with the IMU beside it."""
+    """The first image with a certain pose, with the IMU sample next to it."""
     stream, imu = recording.need_camera(), recording.need_imu()
     taken = stream.time_ns - stream.latency_ns
     fit = np.isin(taken, samples["camera"].time_ns)
@@ -127,7 +126,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     if first is None:
         enough = int((stream.usable[fit].sum(axis=1) >= pnp.FEWEST).sum())
         if enough:
-            raise pnp.no_pose(recording.path or recording.name, enough)
+            raise pnp.no_pose_error(recording.path or recording.name, enough)
         return None
     known: dict[str, Any] = {
         "position": found.position[first],
@@ -145,31 +144,33 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     waited = (taken[first] - taken[0]) / NANOSECONDS
     note = ""
     if waited > 0.0:
-        note = f"waited {waited:.3f} s for an image that tells the pose well, to start from"
+        note = f"waited {waited:.3f} s for an image with a certain pose to start from"
     return Start(int(taken[first]), known, note)
 
 
 def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
-    """Poses of images, and the first that a run can start from: of those that fit the first that is known
-    as well as `Initial` says, less well the longer it takes, or nearly as well as any; None where no pose
-    follows from any. Images are solved for up to there, and as many thereafter as a velocity is found
-    from."""
+    """Poses of images, and the index of the first one that is certain enough to start from.
+
+    The bound on the uncertainty grows with the time waited; if no pose reaches it, one nearly as
+    certain as the best is taken, and None if there is no pose. Images are solved up to that one, and
+    those from which its velocity follows.
+    """
     taken, count = stream.time_ns, len(stream.time_ns)
     solved = np.zeros(count, bool)
     waited = np.maximum(taken - taken[np.argmax(fit)], 0) / NANOSECONDS if count else np.zeros(0)
     sure = stream.usable.sum(axis=1) >= _SURE
-    will_do = _GOOD * np.where(sure, 1.0 + waited / _PATIENCE_S, 1.0)
+    limit = _GOOD * np.where(sure, 1.0 + waited / _PATIENCE_S, 1.0)
     some = _FIRST
     while True:
-        found = pnp.solved(stream)
+        found = pnp.cached_poses(stream)
         solved[np.flatnonzero(fit)[:some]] = True
         if found is None:
             found = pnp.poses(replace(stream, visible=stream.visible & solved[:, None]))
         else:
             solved[:] = True
         valid = found.valid & fit
-        doubt = np.where(valid, _doubt(found), np.inf)
-        good = np.flatnonzero(doubt <= will_do)
+        uncertainty = np.where(valid, _uncertainty(found), np.inf)
+        good = np.flatnonzero(uncertainty <= limit)
         everything = bool(solved[fit].all())
         if good.size:
             first = int(good[0])
@@ -179,25 +180,27 @@ def _first_pose(stream: Camera, fit: Flags) -> tuple[Resection, int | None]:
         elif everything:
             if not valid.any():
                 return found, None
-            return found, int(np.argmax(doubt <= np.where(sure, _GOOD, 1.0) * doubt.min()))
+            return found, int(
+                np.argmax(uncertainty <= np.where(sure, _GOOD, 1.0) * uncertainty.min())
+            )
         some *= 2
 
 
-def _doubt(found: Resection) -> Floats:
-    """(N,) the largest standard deviation of poses, those of `Initial` being 1; of points that are a pixel
-    off at least, as a few fit a pose by chance."""
+def _uncertainty(found: Resection) -> Floats:
+    """(N,) largest standard deviation of each pose in units of `Initial`, for a pixel of noise at least."""
     sigma = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     chance = np.maximum(1.0, _PIXEL / np.maximum(found.error, 1e-9))
     return chance * np.max(sigma / np.repeat([START_POSITION, START_ATTITUDE], 3), axis=1)
 
 
 def _velocity(taken: Times, found: Resection, fit: Flags, first: int) -> Floats:
-    """Velocity (3,), m/s, at an image: slope of a line through the positions of the third of a second from
-    there, since those of single images are too uncertain for a difference, each as it is known; 0 where
-    there is one only."""
+    """Velocity (3,), m/s, at an image: slope of a weighted line through the positions of the next 0.35 s.
+
+    It is zero if there is only one position.
+    """
     t = (taken - taken[first]) / NANOSECONDS
     near = found.valid & fit & (t >= 0.0) & (t <= _LINE_S)
     if near.sum() < 2:
         return np.zeros(3)
-    weight = 1.0 / np.maximum(_doubt(found)[near], 1e-3)
+    weight = 1.0 / np.maximum(_uncertainty(found)[near], 1e-3)
     return np.polynomial.polynomial.polyfit(t[near], found.position[near], 1, w=weight)[1]

@@ -1,9 +1,9 @@
-"""The Earth's gravity and magnetic field as references of attitude: what `triad` and `marg` share.
+"""The Earth's gravity and magnetic field as attitude references, shared by `triad` and `marg`.
 
-Up and magnetic north are those that a recording states: ``gravity_ref`` (free fall, by default along -z)
-and ``field_ref``, of which only the horizontal direction counts (by default y: x is east then, y is north,
-z up). In the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. How far
-the field dips below the horizontal, and how strong it is, is found from each recording.
+Up and magnetic north are those that a recording states: ``gravity_ref`` (by default along -z) and
+``field_ref``, of which only the horizontal direction is used (by default y: x is east, y north, z up). In
+the world of Ang, Khosla and Riviere, which is north, west, up, it is ``[1, 0, 0]``. Dip and strength of the
+field are estimated from each recording.
 """
 
 from dataclasses import replace
@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import GRAVITY_REF
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry import triad
 from jaxekf.pose_solvers import tilt
@@ -20,26 +21,26 @@ from jaxekf.recordings import facts
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Recording
 
-GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 1.0, 0.0)
 _FEWEST = 2
 MOST_HZ = 100.0
-"""Samples of a magnetometer that are used in a second: what is wrong with the field lasts longer."""
+"""Largest number of magnetometer samples per second that are used, since errors of the field last
+longer."""
 _PAUSE_NS = 500_000_000
-"""A longer step is no sampling period."""
+"""A longer step is a pause, not a sampling period."""
 
 
 class Setup(NamedTuple):
-    """What a recording tells of its run."""
+    """Constants of a recording."""
 
     gravity_ref: Any
-    """(3,) free fall in the reference frame, m/s^2."""
+    """(3,) gravity vector in the reference frame, m/s^2."""
     field_ref: Any
     """(3,) unit vector along the magnetic field in the reference frame."""
 
 
 def dipping(up: Floats, north: Floats, dip: float) -> Floats:
-    """(3,) unit vector `dip` radians below a horizontal unit vector."""
+    """(3,) unit vector `dip` radians below the horizontal unit vector `north`."""
     return np.cos(dip) * north - np.sin(dip) * up
 
 
@@ -48,10 +49,13 @@ SETUP = Setup(
 )
 
 
-def need_both(recording: Recording) -> Imu:
-    """The IMU's samples whose rate and specific force are finite; its magnetometer may be slower.
+def require_marg_imu(recording: Recording) -> Imu:
+    """The IMU's samples with finite rate and specific force; its magnetometer may be slower.
 
-    Raises `RecordingError`, which says which of its sensors is not there: one that reads zeros only is not.
+    Raises
+    ------
+    RecordingError
+        If accelerometer or magnetometer is missing or reads only zeros, or if too few samples are finite.
     """
     imu = recording.need_imu()
     finite = np.isfinite(imu.gyroscope).all(axis=1)
@@ -67,14 +71,14 @@ def need_both(recording: Recording) -> Imu:
                 f"adding {columns} to imu.csv, or the model loose where there is a tracker",
             )
     assert imu.magnetometer is not None
-    told = np.isfinite(imu.magnetometer).all(axis=1) & imu.magnetometer.any(axis=1)
-    if finite.sum() < _FEWEST or not (told & finite).any():
+    measured = np.isfinite(imu.magnetometer).all(axis=1) & imu.magnetometer.any(axis=1)
+    if finite.sum() < _FEWEST or not (measured & finite).any():
         raise RecordingError(
             recording.path or recording.name,
             f"{int(finite.sum())} samples of finite rate and specific force,"
-            f" {int((told & finite).sum())} of them with a magnetic field",
+            f" {int((measured & finite).sum())} of them with a magnetic field",
             f"{_FEWEST} or more, and a field in one of them",
-            "a run whose sensors were read together",
+            "a run whose sensors were read at the same times",
         )
     if finite.all():
         return imu
@@ -83,10 +87,12 @@ def need_both(recording: Recording) -> Imu:
 
 
 def setup(recording: Recording) -> Setup:
-    """Up and north as a recording states them, and the field's dip as it is felt in the run.
+    """Up and north as stated by a recording, and the field's dip as measured in the run.
 
-    Raises `RecordingError` where the stated field is vertical, so that it has no north, or where what is
-    stated is no vector, and what `need_both` raises.
+    Raises
+    ------
+    RecordingError
+        If the stated field is vertical, or a stated value is no vector, and as `require_marg_imu`.
     """
     known = facts.known_entries(recording.info, recording.path or recording.name)
     gravity = np.array(known.get("gravity_ref", GRAVITY_REF))
@@ -101,15 +107,15 @@ def setup(recording: Recording) -> Setup:
             "stating another field_ref or gravity_ref in recording.toml",
             column="field_ref",
         )
-    dip = float(np.nanmedian(tilt.field(need_both(recording)).dip))
+    dip = float(np.nanmedian(tilt.magnetic_field(require_marg_imu(recording)).dip))
     return Setup(gravity, dipping(up, level / np.linalg.norm(level), dip))
 
 
 def thinned(imu: Imu, good: Flags) -> Indices:
-    """Rows of an IMU that are good (N,), every n-th so that about `MOST_HZ` are left in a second."""
+    """Every n-th good row (N,) of an IMU, so that about `MOST_HZ` per second remain."""
     rows = np.flatnonzero(good)
     steps = np.diff(imu.time_ns[rows])
-    # The mean, for stamps may come in bunches.
+    # The mean, since time stamps may come in bursts.
     steps = steps[steps < _PAUSE_NS]
     if not steps.size:
         return rows
@@ -119,8 +125,10 @@ def thinned(imu: Imu, good: Flags) -> Indices:
 def attitudes(
     force: Floats, field: Floats, about: Setup, least_sine: float = 1e-6
 ) -> triad.Attitude:
-    """Attitudes (N, 4) of specific forces and fields (N, 3), and where they tell one: where the sine of the
-    angle between the two is not below `least_sine`."""
+    """Attitudes (N, 4) from specific forces and fields (N, 3).
+
+    They are valid if the sine of the angle between the two is not below `least_sine`.
+    """
     return _attitudes(force, field, -about.gravity_ref, about.field_ref, least_sine)
 
 

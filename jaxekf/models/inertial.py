@@ -1,8 +1,16 @@
-"""Position, attitude, velocity and IMU biases, driven by the IMU: what `tight` and `loose_pose` share.
+"""Strapdown state and prediction shared by `tight` and `loose_pose`; not a model by itself.
 
-Tobergte, Pomarlan, Hirzinger (2009), eqs. 18 to 22, in the conventions of this package: the body is the
-IMU's frame, errors of attitude act on the right, gravity is free fall. Their eq. 19 multiplies by
-``[0, t_s w]`` where the exponential belongs, and eqs. 21 and 22 have no noise: biases walk here.
+The equations are those of Tobergte, Pomarlan, Hirzinger (2009), eqs. 18 to 22, in the conventions of this
+package: the body is the IMU's frame, attitude errors act on the right, gravity is the free-fall
+acceleration. Corrections: eq. 19 multiplies by ``[0, t_s w]`` instead of the exponential, and eqs. 21 and
+22 have no noise; here biases are random walks.
+
+- States (15 degrees of freedom): `position` m and `velocity` m/s (reference frame), `q_ref_body` (error:
+  rad, body frame), `bias` rad/s, `accelerometer_bias` m/s^2.
+- Input: gyroscope rad/s and accelerometer m/s^2, body frame.
+- Calibration: `latency` s, `lever_arm` m, `alignment` rad, `clock_drift` s/s, `gyroscope_matrix`,
+  `accelerometer_matrix`.
+- Initial: one standard deviation for each state, in its unit.
 """
 
 from collections.abc import Callable
@@ -12,32 +20,33 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import GRAVITY_REF
+from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.interpolation import InputSample
 from jaxekf.filtering.model import Output, Parameters
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.models import _outputs
 from jaxekf.pose_solvers import marker_pose
 from jaxekf.recordings.types import Floats, Optical, Recording
 
-STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
-
 
 class State(NamedTuple):
-    """The IMU in the tracker's reference frame, and what it measures wrongly."""
+    """The IMU in the tracker's reference frame, and its sensor biases."""
 
     position: Any
     q_ref_body: Any
     velocity: Any
     bias: Any
-    """Of the gyroscope."""
+    """Gyroscope bias, rad/s, body frame."""
     accelerometer_bias: Any
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     position: Any
-    """About the first pose, which is then used as a measurement: keep it and the attitude wide."""
+    """About the first pose, which is then used as a measurement, too: keep it and the attitude large."""
     attitude: Any
     velocity: Any
     bias: Any
@@ -47,37 +56,37 @@ class Initial(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """What is not random and not stated by a recording; corrections of what it states."""
+    """Deterministic parameters: corrections of the values stated in a recording."""
 
     latency: Any
-    """Seconds that the tracker's samples are older than they are said to be; ()."""
+    """Seconds by which the tracker's samples are older than stated; ()."""
     lever_arm: Any
-    """Metres from where the tool's frame is said to be in the body to where it is, body frame; (3,)."""
+    """Correction of the tool frame's position in the body, m, body frame; (3,)."""
     alignment: Any
-    """Rotation vector from the tool's frame as it is said to be to what it is, body frame, rad; (3,)."""
+    """Rotation vector from the stated to the actual tool frame, rad, body frame; (3,)."""
     clock_drift: Any = 0.0
-    """Seconds that the IMU's clock gains on the tracker's in a second; ()."""
+    """Seconds that the IMU's clock gains on the tracker's per second; ()."""
     gyroscope_matrix: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     """Scale, non-orthogonality and alignment, ``rate = gyroscope_matrix @ measured - bias``, (3, 3)."""
     accelerometer_matrix: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """The same of the accelerometer; its frame should be the gyroscope's, (3, 3)."""
+    """The same for the accelerometer, whose frame should be the gyroscope's, (3, 3)."""
 
 
 class Setup(NamedTuple):
-    """What a recording tells of its run."""
+    """Constants of a recording."""
 
     gravity_ref: Any
-    """(3,) free fall in the reference frame, m/s^2."""
+    """(3,) gravity vector in the reference frame, m/s^2."""
     p_body_object: Any
-    """(3,) metres: the point of the tool whose pose is asked for."""
+    """(3,) metres: the point of the tool whose pose is an output."""
     q_body_object: Any
-    """(4,) object to body: the frame of the tool whose attitude is asked for."""
+    """(4,) object to body: the frame of the tool whose attitude is an output."""
 
 
 SPACE: Any = State(
-    Euclidean(3, "m", frame="reference"),
+    _outputs.METRES,
     SO3(),
-    Euclidean(3, "m/s", frame="reference"),
+    _outputs.METRES_PER_SECOND,
     Euclidean(3, "rad/s"),
     Euclidean(3, "m/s^2"),
 )
@@ -101,16 +110,19 @@ CALIBRATION = Calibration(
 )
 CALIBRATION_UNITS = Calibration("s", "m", "rad", "s/s", "1", "1")
 
-SETUP = Setup(np.array(STANDARD_GRAVITY), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+SETUP = Setup(np.array(GRAVITY_REF), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
-    """The IMU carried on by its mean rate and specific force over ``dt``, both constant in the body.
+    """Strapdown integration by mean rate and specific force over ``dt``, both constant in the body frame.
 
-    While the body turns by ``theta`` the force turns with it: its integrals over the step are
-    ``f + theta x f / 2 + theta x (theta x f) / 6`` times dt, and ``f / 2 + theta x f / 6 +
-    theta x (theta x f) / 24`` times dt^2, up to ``theta^3``. ``w`` holds angle, velocity, and the changes
-    of both biases.
+    While the body rotates by ``theta`` the force rotates with it: its integrals over the step are, up to
+    ``theta^3``,
+
+        (f + theta x f / 2 + theta x (theta x f) / 6) dt
+        (f / 2 + theta x f / 6 + theta x (theta x f) / 24) dt^2
+
+    ``w`` holds noise of angle and velocity, and the changes of both biases.
     """
     force = params.calibration.accelerometer_matrix @ u.mean[3:] - x.accelerometer_bias
     turn = _rate(x, u.mean, params) * dt
@@ -131,24 +143,18 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (12, 12) of angle, velocity and bias noise over ``dt``, in the IMU's axes."""
     noise = params.noise
-    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
-    return dt * block_diagonal([linalg.covariance(d, 3) for d in densities])
-
-
-def block_diagonal(blocks: list[Array]) -> Array:
-    """Square matrices (3, 3) on a diagonal."""
-    zero = jnp.zeros((3, 3))
-    rows = [[b if i == j else zero for j in range(len(blocks))] for i, b in enumerate(blocks)]
-    return jnp.block(rows)
+    return dt * linalg.block_covariance(
+        (noise.gyroscope, noise.accelerometer, noise.bias_walk, noise.accelerometer_walk)
+    )
 
 
 def initial_covariance(params: Parameters) -> Array:
-    """Covariance of a belief of independent parts of three numbers each, such as (15, 15)."""
-    return block_diagonal([linalg.covariance(d, 3) for d in params.initial])
+    """Covariance (3n, 3n) of n independent parts of three components each."""
+    return linalg.block_covariance(params.initial)
 
 
 def initial_mean(first: Any) -> State:
-    """The pose and velocity found at the start (the origin where there are none), no biases."""
+    """Pose and velocity of the start (the origin without any), zero biases."""
     zero = jnp.zeros(3)
     return State(
         jnp.asarray(first.get("position", zero)),
@@ -160,7 +166,7 @@ def initial_mean(first: Any) -> State:
 
 
 def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
-    """Free fall (3,) in the reference frame: stated by the recording, or found from its poses `raw()`."""
+    """Gravity vector (3,), m/s^2, reference frame: stated, or estimated from the poses `raw()`."""
     stated = recording.info.get("gravity_ref")
     if stated is None:
         stated = marker_pose.gravity(raw(), recording.need_imu(), recording.path or recording.name)
@@ -168,7 +174,7 @@ def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:
 
 
 def setup(recording: Recording, raw: Callable[[], Optical]) -> Setup:
-    """Gravity and object frame of a recording; gravity found from its poses `raw()` where not stated."""
+    """Gravity and object frame of a recording; gravity is estimated from `raw()` if it is not stated."""
     info = recording.info
     frame = np.asarray(info.get("q_body_object", SETUP.q_body_object), float)
     return Setup(
@@ -179,12 +185,12 @@ def setup(recording: Recording, raw: Callable[[], Optical]) -> Setup:
 
 
 def clock_offset(params: Parameters) -> Array:
-    """The IMU's time of an instant of the tracker's: earlier by the latency not accounted for."""
+    """Offset () of the IMU's clock for the tracker's time: minus the latency, s."""
     return -params.calibration.latency
 
 
 def clock_drift(params: Parameters) -> Array:
-    """Seconds that the IMU's clock gains in a second."""
+    """Seconds () that the IMU's clock gains per second."""
     return params.calibration.clock_drift
 
 
@@ -193,42 +199,39 @@ def _rate(x: State, measured: Array, params: Parameters) -> Array:
 
 
 def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
-    swing = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
-    return x.velocity + rotation.rotate(x.q_ref_body, swing)
+    lever_velocity = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
+    return x.velocity + rotation.rotate(x.q_ref_body, lever_velocity)
 
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:
-    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    """Covariance (3, 3), (rad/s)^2, of the rate output by the gyroscope's own noise."""
     return linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth
 
 
 def _object_velocity_noise(u: InputSample, params: Parameters) -> Array:
-    """Covariance (3, 3) that the gyroscope's own sample puts on the object's velocity, at most.
+    """Upper bound of the covariance (3, 3) of the object's velocity by the gyroscope's own noise.
 
-    The same in all directions, as the attitude is not known here.
+    It is isotropic, as the attitude is not known here.
     """
     arm = params.setup.p_body_object
     each = linalg.diagonal(rate_noise(u, params))
     return jnp.sum(arm * arm) * jnp.max(each) * jnp.eye(3)
 
 
-_IN_REFERENCE = Euclidean(3, "m", frame="reference")
-_SPEED = Euclidean(3, "m/s", frame="reference")
+__getattr__ = renamed(
+    __name__,
+    "STANDARD_GRAVITY>GRAVITY_REF block_diagonal>jaxekf.geometry.linalg.block_diagonal",
+)
+
 
 OUTPUTS = (
-    Output("position", _IN_REFERENCE, "reference", lambda x, u, params: x.position),
-    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-    Output("velocity", _SPEED, "reference", lambda x, u, params: x.velocity),
-    Output(
-        "rate",
-        Euclidean(3, "rad/s"),
-        "body",
-        lambda x, u, params: _rate(x, u.value, params),
-        rate_noise,
-    ),
+    _outputs.POSITION,
+    _outputs.ATTITUDE,
+    _outputs.VELOCITY,
+    _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
     Output(
         "object_position",
-        _IN_REFERENCE,
+        _outputs.METRES,
         "reference",
         lambda x, u, params: x.position + rotation.rotate(x.q_ref_body, params.setup.p_body_object),
     ),
@@ -238,5 +241,11 @@ OUTPUTS = (
         "object",
         lambda x, u, params: rotation.product(x.q_ref_body, params.setup.q_body_object),
     ),
-    Output("object_velocity", _SPEED, "reference", _object_velocity, _object_velocity_noise),
+    Output(
+        "object_velocity",
+        _outputs.METRES_PER_SECOND,
+        "reference",
+        _object_velocity,
+        _object_velocity_noise,
+    ),
 )

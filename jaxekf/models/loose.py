@@ -1,8 +1,17 @@
-"""`loose`: attitude and gyroscope bias, the gyroscope as input, the tracker's attitude as measurement.
+"""`loose`: attitude and gyroscope bias from a tracker's attitude and a gyroscope (recommended).
 
-The recommended model of Cheng's (2023) system: 6 degrees of freedom, error-state attitude, body
-rates. The gyroscope drives the prediction at its own rate, so that nothing is held and nothing about
-the motion needs to be assumed.
+Choose it for a tracker that reports attitudes and an IMU on the tool, if no position is wanted. It is the
+recommended form of Cheng's (2023) system: an error-state attitude and body rates instead of eqs. 1 to 17,
+see `loose_additive`. The gyroscope drives the prediction at its own rate, so nothing about the motion
+needs to be assumed.
+
+- States (6 degrees of freedom): attitude `q_ref_body` (error: rotation vector, rad, body frame) and
+  gyroscope bias `bias`, rad/s.
+- Input: gyroscope, rad/s, body frame.
+- Sensor: `optical`, the tracker's attitude.
+- Noise: `gyroscope` rad/s/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz), `optical` rad.
+- Calibration: `gyroscope_matrix`, `clock_offset` s, `alignment` rad, `clock_drift` s/s.
+- Initial: `attitude` rad, `bias` rad/s.
 """
 
 from collections.abc import Mapping
@@ -12,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import sources
+from jaxekf.models import _outputs, inertial, sources
 
 
 class State(NamedTuple):
@@ -27,35 +37,38 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     gyroscope: Any
     """White noise of the rate, spectral density."""
     bias_walk: Any
     """Random walk of the bias, spectral density of its derivative."""
     optical: Any
-    """The tracker's attitude, standard deviation of a sample, body frame."""
+    """Standard deviation of a sample of the tracker's attitude, body frame."""
 
 
 class Calibration(NamedTuple):
-    """What is not random: ``rate = exp(alignment) @ gyroscope_matrix @ (measured - bias - noise)``."""
+    """Deterministic parameters.
+
+    ``rate = exp(alignment) @ gyroscope_matrix @ (measured - bias - noise)``.
+    """
 
     gyroscope_matrix: Any
-    """Scale, non-orthogonality and alignment of the gyroscope to the tool's frame, (3, 3)."""
+    """Scale, non-orthogonality and rotation from the gyroscope's axes to the tool frame, (3, 3)."""
     clock_offset: Any
-    """Seconds to add to the tracker's time to get the IMU's, positive where the IMU lags; ()."""
+    """Seconds to add to the tracker's time to get the IMU's, positive if the IMU lags; ()."""
     alignment: Any = (0.0, 0.0, 0.0)
-    """Rotation vector from the IMU's frame to the tool's, (3,): what changes when the IMU is mounted anew,
-    while scale and non-orthogonality stay. One of it and the rotation in `gyroscope_matrix` is enough."""
+    """Rotation vector from IMU frame to tool frame, (3,), rad: changes when the IMU is mounted anew,
+    unlike scale and non-orthogonality. Estimate either it or the rotation in `gyroscope_matrix`."""
     clock_drift: Any = 0.0
     """Seconds that the IMU's clock gains on the tracker's in a second; ()."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     attitude: Any
-    """About the first visible tracker sample, which is then used as a measurement: keep it wide."""
+    """About the first visible tracker sample, which is then used as a measurement, too: keep it large."""
     bias: Any
     """About zero."""
 
@@ -64,7 +77,7 @@ SPACE: Any = State(SO3(), Euclidean(3, "rad/s"))
 
 
 def rate_matrix(params: Parameters) -> Array:
-    """From the gyroscope's axes to the tool's rate, (3, 3)."""
+    """Matrix (3, 3) from the gyroscope's axes to the tool's rate."""
     turn = rotation.to_matrix(rotation.exp(params.calibration.alignment))
     return turn @ params.calibration.gyroscope_matrix
 
@@ -80,16 +93,16 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 
 
 def process_noise(params: Parameters, dt: Array) -> Array:
-    """Covariance (6, 6) of the angle and bias noise over ``dt``, in the gyroscope's own axes.
+    """Covariance (6, 6) of angle and bias noise over ``dt``, in the gyroscope's axes.
 
-    Exact for the double integrator, so that cutting a step in two changes nothing: the bias walks
-    while it is being integrated.
+    It is exact for the double integrator (the bias changes while it is integrated), so that splitting
+    a step changes nothing.
     """
     return angle_and_bias_noise(params.noise.gyroscope, params.noise.bias_walk, dt)
 
 
 def angle_and_bias_noise(rate: Array, bias_walk: Array, dt: Array) -> Array:
-    """Covariance (6, 6) of `process_noise`, of the densities of the rate and of its bias's derivative."""
+    """The covariance (6, 6) of `process_noise` from the densities of rate and bias derivative."""
     white = linalg.covariance(rate, 3) * dt
     walk = linalg.covariance(bias_walk, 3)
     cross = -0.5 * walk * dt**2
@@ -97,7 +110,7 @@ def angle_and_bias_noise(rate: Array, bias_walk: Array, dt: Array) -> Array:
 
 
 def predict_optical(x: State, u: Any, params: Parameters, aux: Any) -> Array:
-    """The tracker sees the attitude itself."""
+    """The attitude (4,), which the tracker measures directly."""
     return x.q_ref_body
 
 
@@ -106,23 +119,27 @@ def optical_noise(params: Parameters, aux: Any, dt: Array) -> Array:
     return linalg.covariance(params.noise.optical, 3)
 
 
+def first_values(
+    first: Mapping[str, Any], attitude_sensor: str = "optical"
+) -> tuple[Array, Array, Array]:
+    """Attitude (4,), rate (3,) and bias (3,) of the first visible samples.
+
+    A missing attitude is the identity, a missing rate zero; the bias is zero.
+    """
+    attitude, rate = first.get(attitude_sensor), first.get("gyroscope")
+    q = rotation.identity() if attitude is None else rotation.normalise(jnp.asarray(attitude))
+    zero = jnp.zeros(3, q.dtype)
+    return q, zero if rate is None else jnp.asarray(rate), zero
+
+
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude (the identity if there is none) and no bias."""
-    seen = first.get("optical")
-    q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
-    return State(q, jnp.zeros(3, q.dtype))
-
-
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (6, 6)."""
-    zero = jnp.zeros((3, 3))
-    attitude = linalg.covariance(params.initial.attitude, 3)
-    bias = linalg.covariance(params.initial.bias, 3)
-    return jnp.block([[attitude, zero], [zero, bias]])
+    """The first visible attitude (the identity if there is none) and zero bias."""
+    q, _, bias = first_values(first)
+    return State(q, bias)
 
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:
-    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    """Covariance (3, 3), (rad/s)^2, of the rate output by the gyroscope's own noise."""
     matrix = rate_matrix(params)
     white = linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth
     return matrix @ white @ matrix.T
@@ -160,7 +177,7 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
     input=Input(
         "gyroscope",
@@ -169,13 +186,10 @@ MODEL = Model(
         lambda params: params.calibration.clock_drift,
     ),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
-            lambda x, u, params: _rate(x, u.value, params),
-            rate_noise,
-        ),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
     ),
 )
+
+
+__getattr__ = renamed(__name__, "initial_covariance>jaxekf.models.inertial.initial_covariance")

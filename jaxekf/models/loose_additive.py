@@ -1,26 +1,32 @@
-"""`loose_additive`: the filter of Cheng (2023) as published, its misprints mended.
+"""`loose_additive`: the filter of Cheng (2023), eqs. 1 to 17, as published, with misprints corrected.
 
-Ten numbers (quaternion, rate, bias), additive errors, the rate in the reference frame acting on the
-left, every stream held to the tracker's instants, eqs. 1 to 17. It is here to reproduce the paper and
-as the Euclidean case of the same core; use `loose` for work: the measured rate is taken as it is, so
-this model holds only while the axis of rotation is constant and the run starts at the identity.
+Choose it only to reproduce the paper; use `loose` for work. Errors are additive, the rate acts on the left
+in the reference frame, and every stream is held to the tracker's instants. The measured rate is used as it
+is, so the model is right only for a constant axis of rotation and a start at the identity.
 
-Mended: eq. 14 ends in ``q(k)``; eq. 15's identity is 4 x 4; eq. 17's first term divides by the squared
-rate (here by autodiff); the updated quaternion is normalised, and the sign of each measured one follows
-the predicted one.
+Corrections: eq. 14 ends in ``q(k)``; eq. 15's identity is 4 x 4; eq. 17's first term divides by the squared
+rate (here by autodiff); the updated quaternion is normalised, and the sign of each measured one follows the
+predicted one.
+
+- States (10): quaternion `q_ref_body`, `rate_ref` rad/s (reference frame), `bias` rad/s.
+- Input: none.
+- Sensors: `optical`, the quaternion (eq. 11); `gyroscope`, rate plus bias (eq. 12).
+- Noise: `quaternion` 1/sqrt(s), `acceleration` rad/s^2/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `optical` 1, `gyroscope` rad/s.
+- Calibration: none.
+- Initial: `quaternion` 1, `rate` rad/s, `bias` rad/s.
 """
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor
+from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
-from jaxekf.geometry.manifold import SO3, AdditiveQuaternion, Euclidean
-from jaxekf.models import loose, sources
+from jaxekf.geometry.manifold import AdditiveQuaternion, Euclidean
+from jaxekf.models import _outputs, loose, sources
 
 
 class State(NamedTuple):
@@ -32,7 +38,7 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random. The paper's ``Q = T^2 Sigma_w``: a density here is ``sqrt(T Sigma_w)``."""
+    """Noise parameters. The paper's ``Q = T^2 Sigma_w``; a density here is ``sqrt(T Sigma_w)``."""
 
     quaternion: Any
     """Process noise of each quaternion component, spectral density; shape (), (4,) or (4, 4)."""
@@ -41,17 +47,17 @@ class Noise(NamedTuple):
     bias_walk: Any
     """Process noise of the bias, spectral density."""
     optical: Any
-    """Measured quaternion components, standard deviation of a sample; shape (), (4,) or (4, 4)."""
+    """Standard deviation of a sample's quaternion components; shape (), (4,) or (4, 4)."""
     gyroscope: Any
-    """Measured rate, standard deviation of a held sample."""
+    """Standard deviation of a held rate sample."""
 
 
 class Calibration(NamedTuple):
-    """This model has nothing to calibrate."""
+    """This model has no calibration parameters."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     quaternion: Any
     rate: Any
@@ -63,24 +69,15 @@ SPACE: Any = State(AdditiveQuaternion(), Euclidean(3, "rad/s"), Euclidean(3, "ra
 
 def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
     """Eq. 14: ``q(k+1) = g(rate, T) q(k)``; rate and bias are random walks (eqs. 9, 10)."""
-    turned = rotation.product(rotation.exp(x.rate_ref * dt), x.q_ref_body)
-    return State(turned + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
-
-
-def _block_diagonal(leaves: tuple[Any, Any, Any]) -> Array:
-    blocks = [linalg.covariance(leaf, dim) for leaf, dim in zip(leaves, (4, 3, 3), strict=True)]
-    rows = []
-    for i, row in enumerate(blocks):
-        rows.append(
-            [row if i == j else jnp.zeros((row.shape[0], b.shape[0])) for j, b in enumerate(blocks)]
-        )
-    return jnp.block(rows)
+    rotated = rotation.product(rotation.exp(x.rate_ref * dt), x.q_ref_body)
+    return State(rotated + w[:4], x.rate_ref + w[4:7], x.bias + w[7:])
 
 
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (10, 10), ``Gamma Sigma_w Gamma'`` with ``Gamma = T I``, written in densities."""
     noise = params.noise
-    return _block_diagonal((noise.quaternion, noise.acceleration, noise.bias_walk)) * dt
+    densities = (noise.quaternion, noise.acceleration, noise.bias_walk)
+    return linalg.block_covariance(densities, (4, 3, 3)) * dt
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
@@ -99,24 +96,22 @@ def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 
 def project(x: State) -> State:
-    """The updated quaternion back on the unit sphere, which an additive update leaves."""
+    """The updated quaternion normalised, as an additive update leaves the unit sphere."""
     return x._replace(q_ref_body=rotation.normalise(x.q_ref_body))
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude, the first measured rate, and no bias."""
-    start = loose.initial_mean(first)
-    rate = first.get("gyroscope")
-    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
+    """The first visible attitude, the first measured rate, and zero bias."""
+    return State(*loose.first_values(first))
 
 
 def initial_covariance(params: Parameters) -> Array:
     """Covariance (10, 10)."""
-    return _block_diagonal(tuple(params.initial))
+    return linalg.block_covariance(params.initial, (4, 3, 3))
 
 
 def rate_body(x: State, u: Any, params: Parameters) -> Array:
-    """The rate turned into the body frame, where the other models and the encoder give it."""
+    """The rate (3,) rotated into the body frame, in which other models and the encoder express it."""
     return rotation.rotate_inverse(x.q_ref_body, x.rate_ref)
 
 
@@ -167,8 +162,8 @@ MODEL = Model(
     initial_covariance=initial_covariance,
     start_with=("optical",),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output("rate", Euclidean(3, "rad/s"), "body", rate_body),
+        _outputs.ATTITUDE,
+        _outputs.rate(rate_body),
     ),
     project=project,
     hold_to="optical",

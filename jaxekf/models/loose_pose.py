@@ -1,7 +1,13 @@
-"""`loose_pose`: the state of `tight`, fed by the tracker's pose of the whole tool.
+"""`loose_pose`: pose, velocity and IMU biases from a tracker's pose of the tool and an IMU.
 
-What Tobergte, Pomarlan, Hirzinger (2009) compare with, and the model for trackers that give a pose (NDI
-tools, motion capture). Where a recording holds single markers only, their raw pose is taken.
+Choose it for trackers that report a pose (NDI tools, motion capture). For single markers it uses the pose
+computed from each frame, which `tight` avoids; Tobergte, Pomarlan, Hirzinger (2009) compare the two. The
+prediction is their eqs. 18 to 22, see `inertial`.
+
+- States (15 degrees of freedom), input, calibration and initial deviations: those of `inertial`.
+- Sensor: `optical`, position (m, reference frame) of the tracked point and attitude of the tool.
+- Noise: `gyroscope` rad/s/sqrt(Hz), `accelerometer` m/s^2/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `accelerometer_walk` m/s^3/sqrt(Hz), `position` m, `optical` rad.
 """
 
 from collections.abc import Mapping
@@ -12,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
@@ -30,7 +37,7 @@ class Pose(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     gyroscope: Any
     accelerometer: Any
@@ -38,24 +45,24 @@ class Noise(NamedTuple):
     """Random walk of the gyroscope's bias."""
     accelerometer_walk: Any
     position: Any
-    """The tracker's position, standard deviation of a sample, reference frame; a reported fit error
-    adds to it."""
+    """Standard deviation of a sample of the tracker's position, reference frame; a reported fit error is
+    added."""
     optical: Any
-    """The tracker's attitude, standard deviation of a sample, body frame."""
+    """Standard deviation of a sample of the tracker's attitude, body frame."""
 
 
 class Setup(NamedTuple):
-    """What a recording tells of its run; fields as in `inertial.Setup`."""
+    """Constants of a recording; further fields as in `inertial.Setup`."""
 
     gravity_ref: Any
     p_body_object: Any
     q_body_object: Any
     p_body_tool: Any
-    """(3,) metres: the point whose position the tracker gives."""
+    """(3,) metres: the point whose position the tracker reports, body frame."""
 
 
 def predict_pose(x: inertial.State, u: Any, params: Parameters, aux: Any) -> Pose:
-    """Where the tracked point is, and the tool's attitude."""
+    """Position of the tracked point and attitude of the tool."""
     point = params.setup.p_body_tool + params.calibration.lever_arm
     turn = rotation.exp(params.calibration.alignment)
     return Pose(
@@ -64,13 +71,13 @@ def predict_pose(x: inertial.State, u: Any, params: Parameters, aux: Any) -> Pos
 
 
 def pose_noise(params: Parameters, aux: Any, dt: Array) -> Array:
-    """Covariance (6, 6) of a pose; `aux` is its reported error in metres."""
+    """Covariance (6, 6) of a pose; `aux` is its reported error, m."""
     position = linalg.covariance(params.noise.position, 3) + aux * aux * jnp.eye(3)
-    return inertial.block_diagonal([position, linalg.covariance(params.noise.optical, 3)])
+    return linalg.block_diagonal([position, linalg.covariance(params.noise.optical, 3)])
 
 
 def raw_pose(recording: Recording) -> Optical:
-    """The tracker's pose, or that of the markers where there are only those."""
+    """The tracker's pose, or that of its markers."""
     if recording.optical is None and recording.markers is not None:
         return marker_pose.from_markers(recording.markers)
     return recording.need_optical()
@@ -79,11 +86,11 @@ def raw_pose(recording: Recording) -> Optical:
 def _source(recording: Recording) -> Samples:
     optical = raw_pose(recording)
     position = sources.tracked_position(optical, recording)
-    seen = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
-    value = Pose(np.where(seen[:, None], position, 0.0), optical.q_ref_body)
-    error = np.zeros(len(seen)) if optical.error is None else np.nan_to_num(optical.error)
+    valid = optical.valid & np.asarray(np.isfinite(position).all(axis=1))
+    value = Pose(np.where(valid[:, None], position, 0.0), optical.q_ref_body)
+    error = np.zeros(len(valid)) if optical.error is None else np.nan_to_num(optical.error)
     taken = optical.time_ns - optical.latency_ns
-    return Samples(taken, value, seen, error, optical.latency_ns, ("optical",))
+    return Samples(taken, value, valid, error, optical.latency_ns, ("optical",))
 
 
 def _setup(recording: Recording) -> Setup:
@@ -93,34 +100,36 @@ def _setup(recording: Recording) -> Setup:
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first visible pose that can be believed (`pose.first_steady`; of single markers also one that
-    fits the tool); what came before is dropped."""
-    seen = samples["optical"]
-    visible = np.asarray(seen.mask.all(axis=1))
+    """The first visible pose that agrees with the gyroscope; earlier samples are dropped.
+
+    See `marker_pose.first_consistent_pose`; a pose from single markers must also fit the tool.
+    """
+    tracked = samples["optical"]
+    visible = np.asarray(tracked.mask.all(axis=1))
     if recording.optical is None and recording.markers is not None:
-        visible &= _fits(recording, seen.time_ns)
+        visible &= _fits(recording, tracked.time_ns)
     arm = _tracked_point(recording)
-    origin = seen.value.position - sources.turned(seen.value.q_ref_body, arm)
-    poses = Optical(seen.time_ns, seen.value.q_ref_body, visible, origin)
-    first = marker_pose.first_steady(poses, recording.need_imu())
+    origin = tracked.value.position - sources.rotated_to_reference(tracked.value.q_ref_body, arm)
+    poses = Optical(tracked.time_ns, tracked.value.q_ref_body, visible, origin)
+    first = marker_pose.first_consistent_pose(poses, recording.need_imu())
     if first is None:
         return None
     skipped = int(visible[:first].sum())
     known = {
         "position": origin[first],
-        "q_ref_body": seen.value.q_ref_body[first],
-        "velocity": marker_pose.velocity_at(seen.time_ns, origin, visible, first),
+        "q_ref_body": tracked.value.q_ref_body[first],
+        "velocity": marker_pose.velocity_at(tracked.time_ns, origin, visible, first),
     }
     note = (
-        f"{skipped} poses at the start do not turn as the gyroscope did, or jump: they are not used"
+        f"{skipped} poses at the start contradict the gyroscope or jump: they are not used"
         if skipped
         else ""
     )
-    return Start(int(seen.time_ns[first]), known, note)
+    return Start(int(tracked.time_ns[first]), known, note)
 
 
 def _fits(recording: Recording, taken: Times) -> Flags:
-    """Of the poses taken then, those whose markers fit the tool as well as others do."""
+    """Poses at these times whose markers fit the tool as well as most."""
     markers = recording.need_markers()
     fit = marker_pose.fit_markers(markers, recording.path or recording.name)
     chosen = np.isin(markers.time_ns - markers.latency_ns, taken)
@@ -130,14 +139,14 @@ def _fits(recording: Recording, taken: Times) -> Flags:
 
 
 def _tracked_point(recording: Recording) -> Any:
-    said = raw_pose(recording).p_body_tool
-    return np.zeros(3) if said is None else np.asarray(said, float)
+    stated = raw_pose(recording).p_body_tool
+    return np.zeros(3) if stated is None else np.asarray(stated, float)
 
 
 DEFAULTS = Parameters(
     Noise(
         gyroscope=np.deg2rad(0.05),
-        accelerometer=1.85e-3 * 9.80665,
+        accelerometer=1.85e-3 * STANDARD_GRAVITY,
         bias_walk=np.deg2rad(0.002),
         accelerometer_walk=1e-3,
         position=0.5e-3,

@@ -1,9 +1,17 @@
 """`loose_rate`: attitude, angular rate and gyroscope bias, the gyroscope as a measurement.
 
-Cheng's (2023) state with an error-state attitude and body rates: 9 degrees of freedom. The rate is a
-random walk driven by a density of angular acceleration, so that smooth motion filters the
-gyroscope's own noise, which `loose` does not. That density says how the tool moves, which only the
-recordings know: tune it before use.
+Choose it for smooth motion with a noisy gyroscope, whose own noise it filters, unlike `loose`. Its density
+of angular acceleration describes the motion and must be tuned to the recordings first. The state is Cheng's
+(2023), with an error-state attitude and body rates instead of his eqs. 9 to 14.
+
+- States (9 degrees of freedom): attitude `q_ref_body` (error: rad, body frame), `rate` rad/s (body frame),
+  `bias` rad/s.
+- Input: none.
+- Sensors: `optical`, the tracker's attitude; `gyroscope`, rate plus bias.
+- Noise: `acceleration` rad/s^2/sqrt(Hz), `gyroscope` rad/s/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `optical` rad.
+- Calibration: none.
+- Initial: `attitude` rad, `rate` rad/s, `bias` rad/s.
 """
 
 from collections.abc import Mapping
@@ -13,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor
+from jaxekf._support.deprecations import renamed
+from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg
 from jaxekf.geometry.manifold import SO3, Euclidean
-from jaxekf.models import loose, sources
+from jaxekf.models import _outputs, inertial, loose, sources
 
 
 class State(NamedTuple):
@@ -28,24 +37,24 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     acceleration: Any
-    """Angular acceleration, spectral density: how fast the rate may change."""
+    """Angular acceleration, spectral density."""
     gyroscope: Any
     """White noise of the measured rate, spectral density."""
     bias_walk: Any
     """Random walk of the bias, spectral density of its derivative."""
     optical: Any
-    """The tracker's attitude, standard deviation of a sample, body frame."""
+    """Standard deviation of a sample of the tracker's attitude, body frame."""
 
 
 class Calibration(NamedTuple):
-    """This model has nothing to calibrate."""
+    """This model has no calibration parameters."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     attitude: Any
     rate: Any
@@ -73,27 +82,18 @@ def process_noise(params: Parameters, dt: Array) -> Array:
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
-    """Rate plus bias."""
+    """Rate plus bias (3,), rad/s."""
     return x.rate + x.bias
 
 
 def gyroscope_noise(params: Parameters, aux: Any, dt: Array) -> Array:
-    """Covariance (3, 3) of a gyroscope sample that averages over its own period ``dt``."""
+    """Covariance (3, 3) of a gyroscope sample that is the mean over its sampling period ``dt``."""
     return linalg.covariance(params.noise.gyroscope, 3) / dt
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first visible attitude, the first measured rate, and no bias."""
-    start = loose.initial_mean(first)
-    rate = first.get("gyroscope")
-    return State(start.q_ref_body, start.bias if rate is None else jnp.asarray(rate), start.bias)
-
-
-def initial_covariance(params: Parameters) -> Array:
-    """Covariance (9, 9)."""
-    blocks = [linalg.covariance(leaf, 3) for leaf in params.initial]
-    zero = jnp.zeros((3, 3))
-    return jnp.block([[blocks[i] if i == j else zero for j in range(3)] for i in range(3)])
+    """The first visible attitude, the first measured rate, and zero bias."""
+    return State(*loose.first_values(first))
 
 
 DEFAULTS = Parameters(
@@ -135,10 +135,13 @@ MODEL = Model(
     units=UNITS,
     noise_dims=Noise(3, 3, 3, 3),
     initial_mean=initial_mean,
-    initial_covariance=initial_covariance,
+    initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: x.rate),
     ),
 )
+
+
+__getattr__ = renamed(__name__, "initial_covariance>jaxekf.models.inertial.initial_covariance")

@@ -1,16 +1,25 @@
-"""`marg`: attitude from gyroscope, accelerometer and magnetometer alone, tunable.
+"""`marg`: attitude from gyroscope, accelerometer and magnetometer alone.
 
-The better version of Ang, Khosla and Riviere's filter (`triad`), where no tracker is. Three things make it
-so, each of them a parameter that a tuner may set:
+Choose it without a tracker, if the body accelerates or the magnetic field is disturbed. It improves on the
+filter of Ang, Khosla and Riviere (`triad`) in three ways, each with parameters that a tuner can set:
 
-- The accelerometer does not measure gravity: it is an input, integrated to a velocity, and a *pseudo-
-  measurement* says that the velocity is near zero. That is a low-pass in Kalman form, of the order and
-  corner that the data want, and what gravity is follows from it.
-- The magnetometer is a direction (in units of the field's strength) whose noise grows with what norm and
-  dip are off: a disturbed field is mostly of another size or slope as well.
-- At rest the gyroscope reads its bias.
+- The accelerometer does not measure gravity: it is an input, integrated to a velocity, and a
+  *pseudo-measurement* states that the velocity is near zero. This is a low-pass in Kalman form, with order
+  and corner frequency set by the noise, from which the direction of gravity follows.
+- The magnetometer measures a direction (in units of the field's strength) whose noise grows with the errors
+  of norm and dip, since a disturbed field mostly differs in one of them.
+- At rest the gyroscope measures its bias.
 
-12 degrees of freedom. Gyroscope and accelerometer are inputs, so that nothing is held.
+- States (12 degrees of freedom): `q_ref_body` (error: rad, body frame), `velocity` m/s (reference frame),
+  `bias` rad/s, `scale` (gyroscope scale error, 1).
+- Input: gyroscope rad/s and accelerometer m/s^2, body frame.
+- Sensors: `magnetometer` (field direction), `velocity` (pseudo-measurement of zero), `rest` (bias).
+- Noise: `gyroscope` rad/s/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz), `accelerometer` m/s^2/sqrt(Hz),
+  `velocity` m/s/sqrt(Hz), `rest` rad/s/sqrt(Hz), `magnetometer` 1/sqrt(Hz), `norm` 1/sqrt(Hz),
+  `dip` 1/rad/sqrt(Hz).
+- Calibration: `gyroscope_matrix`, `accelerometer_bias` m/s^2, `clock_offset` s, `magnetometer_lag` s,
+  `declination` rad.
+- Initial: `attitude` rad, `velocity` m/s, `bias` rad/s, `scale` 1.
 """
 
 from collections.abc import Mapping
@@ -21,32 +30,33 @@ import numpy as np
 from jax import Array
 
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor, Start
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import _earth as earth
-from jaxekf.models import inertial, sources
+from jaxekf.models import _outputs, inertial, sources
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import NANOSECONDS, Recording, Samples
 
 START_S = 0.1
-"""Seconds whose mean gives the attitude to start from."""
+"""Seconds whose mean specific force gives the initial attitude."""
 LEAST_SINE = 0.05
-"""Of the angle between force and field there: a field that is nearly vertical tells no heading."""
+"""Smallest sine of the angle between force and field at the start: a nearly vertical field gives no
+heading."""
 
 
 class State(NamedTuple):
-    """Attitude in the reference frame, velocity there, and what the gyroscope measures wrongly."""
+    """Attitude and velocity in the reference frame, and errors of the gyroscope."""
 
     q_ref_body: Any
     velocity: Any
     bias: Any
     scale: Any
-    """Of the gyroscope's axes, beside 1."""
+    """Scale error of the gyroscope's axes."""
 
 
 class Noise(NamedTuple):
-    """What is random: leaves of shape () or, but for the magnetometer's, (3,) or (3, 3)."""
+    """Noise parameters: of shape () or, but for the magnetometer's, (3,) or (3, 3)."""
 
     gyroscope: Any
     """White noise of the rate, spectral density."""
@@ -55,39 +65,40 @@ class Noise(NamedTuple):
     accelerometer: Any
     """White noise of the specific force, spectral density."""
     velocity: Any
-    """By what the body's velocity is not zero, spectral density."""
+    """Deviation of the body's velocity from zero, spectral density."""
     rest: Any
-    """White noise of the rate at rest, spectral density: how well rest tells the bias."""
+    """White noise of the rate at rest, spectral density: the weight of rest for the bias."""
     magnetometer: Any
-    """Of a field that has norm and dip of the undisturbed, share of its norm, spectral density; ()."""
+    """Noise of a field with the norm and dip of the undisturbed one, share of its norm, spectral
+    density; ()."""
     norm: Any
-    """The same for each unit that the norm is off, as a share; ()."""
+    """Additional noise per unit of the norm's relative error; ()."""
     dip: Any
-    """The same for each radian that the dip is off; ()."""
+    """Additional noise per radian of the dip's error; ()."""
 
 
 class Calibration(NamedTuple):
-    """What is not random: ``rate = (1 + scale) * (gyroscope_matrix @ (measured - bias))``."""
+    """Deterministic parameters: ``rate = (1 + scale) * (gyroscope_matrix @ (measured - bias))``."""
 
     gyroscope_matrix: Any
     """Scale, non-orthogonality and alignment, (3, 3)."""
     accelerometer_bias: Any
     """(3,) m/s^2."""
     clock_offset: Any
-    """Seconds to add to the time of truth and estimate to get the gyroscope's, positive where it lags."""
+    """Seconds to add to the time of truth and estimate to get the gyroscope's, positive if it lags."""
     magnetometer_lag: Any
-    """Seconds by which a magnetometer's sample is older than the estimate it is compared with; ()."""
+    """Seconds by which a magnetometer sample is older than the estimate at its time stamp; ()."""
     declination: Any
     """Radians from the stated north to that of the field, positive to the east; ()."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     attitude: Any
-    """About that of accelerometer and magnetometer at the start."""
+    """About the attitude of accelerometer and magnetometer at the start."""
     velocity: Any
-    """About zero, as bias and scale."""
+    """About zero, as for bias and scale."""
     bias: Any
     scale: Any
 
@@ -101,14 +112,14 @@ SPACE: Any = State(
 
 
 def body_rate(x: State, measured: Array, params: Parameters) -> Array:
-    """The rate (3,) of a gyroscope's reading (the first three numbers)."""
+    """The rate (3,), rad/s, for a reading of the gyroscope (the first three components)."""
     return (1.0 + x.scale) * (params.calibration.gyroscope_matrix @ (measured[:3] - x.bias))
 
 
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
-    """Strapdown integration of the mean rate and specific force over ``dt``, as in `inertial`.
+    """Strapdown integration of mean rate and specific force over ``dt``, as in `inertial`.
 
-    ``w`` holds angle, velocity and the change of the bias.
+    ``w`` holds noise of angle and velocity, and the change of the bias.
     """
     force = u.mean[3:] - params.calibration.accelerometer_bias
     turn = body_rate(x, u.mean, params) * dt
@@ -126,12 +137,11 @@ def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (9, 9) of angle, velocity and bias noise over ``dt``."""
     noise = params.noise
-    densities = (noise.gyroscope, noise.accelerometer, noise.bias_walk)
-    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
+    return dt * linalg.block_covariance((noise.gyroscope, noise.accelerometer, noise.bias_walk))
 
 
 def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
-    """The field's direction in the body as it was when the magnetometer took it."""
+    """The field's direction (3,) in the body frame at the time of the magnetometer's measurement."""
     gravity, declination = params.setup.gravity_ref, params.calibration.declination
     fall = gravity / jnp.sqrt(jnp.sum(gravity * gravity))
     field = rotation.rotate(rotation.exp(declination * fall), params.setup.field_ref)
@@ -140,14 +150,14 @@ def predict_magnetometer(x: State, u: InputSample, params: Parameters, aux: Any)
 
 
 def magnetometer_noise(params: Parameters, aux: Any, dt: Array) -> Array:
-    """Covariance (3, 3); `aux` is by what norm (a share) and dip (rad) of the sample are off."""
+    """Covariance (3, 3); `aux` holds the errors of norm (relative) and dip (rad) of the sample."""
     noise = params.noise
     off = noise.magnetometer**2 + (noise.norm * aux[0]) ** 2 + (noise.dip * aux[1]) ** 2
     return off / dt * jnp.eye(3)
 
 
 def predict_velocity(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
-    """The velocity, to be held near zero."""
+    """The velocity (3,), m/s, whose pseudo-measurement is zero."""
     return x.velocity
 
 
@@ -157,7 +167,7 @@ def velocity_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 
 def predict_rest(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
-    """What the gyroscope reads at rest: its bias, whatever its scale."""
+    """Reading of a static gyroscope: its bias, independent of its scale."""
     return x.bias
 
 
@@ -167,10 +177,10 @@ def rest_noise(params: Parameters, aux: Any, dt: Array) -> Array:
 
 
 def magnetometer(recording: Recording) -> Samples:
-    """The field (N, 3) in units of its median norm, and by what norm and dip are off."""
-    imu = earth.need_both(recording)
+    """The field (N, 3) in units of its median norm, with the errors of norm and dip."""
+    imu = earth.require_marg_imu(recording)
     assert imu.magnetometer is not None
-    field = tilt.field(imu)
+    field = tilt.magnetic_field(imu)
     good = np.isfinite(field.dip)
     rows = earth.thinned(imu, good)
     norm, dip = np.nanmedian(field.norm), np.nanmedian(field.dip)
@@ -182,47 +192,47 @@ def magnetometer(recording: Recording) -> Samples:
 
 
 def velocity(recording: Recording) -> Samples:
-    """Zeros (N, 3) at the instants of the pseudo-measurement, those of the magnetometer if it is fast."""
-    imu = earth.need_both(recording)
+    """Zeros (N, 3) at the instants of the pseudo-measurement, at most 100 a second."""
+    imu = earth.require_marg_imu(recording)
     rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
     return Samples(imu.time_ns[rows], np.zeros((len(rows), 3)), np.ones(len(rows), bool))
 
 
 def rest(recording: Recording) -> Samples:
-    """Mean rates (N, 3) since the instant before, visible where the IMU rests."""
-    imu = earth.need_both(recording)
+    """Mean rates (N, 3) since the previous instant, visible if the IMU is static."""
+    imu = earth.require_marg_imu(recording)
     rows = earth.thinned(imu, np.ones(len(imu.time_ns), bool))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyroscope, axis=0)])
     before = np.concatenate([[-1], rows[:-1]])
     mean = (total[rows + 1] - total[before + 1]) / (rows - before)[:, None]
-    return Samples(imu.time_ns[rows], mean, tilt.still(imu)[rows])
+    return Samples(imu.time_ns[rows], mean, tilt.static_samples(imu)[rows])
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first magnetometer sample that gives an attitude with the mean specific force after it."""
-    imu, about = earth.need_both(recording), earth.setup(recording)
+    """The first magnetometer sample that, with the mean specific force after it, gives an attitude."""
+    imu, about = earth.require_marg_imu(recording), earth.setup(recording)
     assert imu.accelerometer is not None
-    seen = samples["magnetometer"]
+    field = samples["magnetometer"]
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accelerometer, axis=0)])
-    begin = np.searchsorted(imu.time_ns, seen.time_ns)
-    end = np.searchsorted(imu.time_ns, seen.time_ns + int(START_S * NANOSECONDS))
-    found = earth.attitudes(total[end] - total[begin], seen.value, about, LEAST_SINE)
+    begin = np.searchsorted(imu.time_ns, field.time_ns)
+    end = np.searchsorted(imu.time_ns, field.time_ns + int(START_S * NANOSECONDS))
+    found = earth.attitudes(total[end] - total[begin], field.value, about, LEAST_SINE)
     good = np.flatnonzero(np.asarray(found.valid))
     if not good.size:
         return None
     q = np.asarray(found.q_ref_body)[good[0]]
-    return Start(int(seen.time_ns[good[0]]), {"q_ref_body": q})
+    return Start(int(field.time_ns[good[0]]), {"q_ref_body": q})
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The attitude found at the start (the identity if there is none), all else zero."""
+    """The attitude of the start (the identity without any), all other states zero."""
     q = jnp.asarray(first.get("q_ref_body", rotation.identity()))
     zero = jnp.zeros(3, q.dtype)
     return State(q, zero, zero, zero)
 
 
 def rate_noise(u: InputSample, params: Parameters) -> Array:
-    """Covariance (3, 3) that the gyroscope's own sample puts on the rate, (rad/s)^2."""
+    """Covariance (3, 3), (rad/s)^2, of the rate output by the gyroscope's own noise."""
     matrix = params.calibration.gyroscope_matrix
     return linalg.congruence(matrix, linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth)
 
@@ -297,13 +307,7 @@ MODEL = Model(
     setup=earth.setup,
     input=Input("imu", sources.imu, lambda params: params.calibration.clock_offset),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
-            lambda x, u, params: body_rate(x, u.value, params),
-            rate_noise,
-        ),
+        _outputs.ATTITUDE,
+        _outputs.rate(lambda x, u, params: body_rate(x, u.value, params), rate_noise),
     ),
 )

@@ -1,13 +1,14 @@
-"""Where a recording holds what the sensors and inputs of the models read."""
+"""Samples that the sensors and inputs of the models read from a recording."""
 
 import numpy as np
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.recordings.types import Floats, Markers, Optical, Recording, Samples, to_scipy
 
 
 def optical_attitude(recording: Recording) -> Samples:
-    """The tracker's attitude, quaternions (N, 4), hidden samples masked."""
+    """The tracker's attitude, quaternions (N, 4), body to reference; invisible samples are masked."""
     if recording.optical is None and recording.markers is not None:
         raise RecordingError(
             recording.path or recording.name,
@@ -22,13 +23,13 @@ def optical_attitude(recording: Recording) -> Samples:
 
 
 def single_markers(recording: Recording) -> Markers:
-    """The markers, or an error that names a model for what the run has instead."""
+    """The markers; the error without any names the model for the stream that the run has instead."""
     if recording.markers is None and recording.optical is not None:
         raise RecordingError(
             recording.path or recording.name,
             "an optical stream and no single markers",
             "markers for this model",
-            "the model loose, or loose_pose where the tracker tells positions",
+            "the model loose, or loose_pose if the tracker reports positions",
         )
     return recording.need_markers()
 
@@ -56,7 +57,7 @@ def imu(recording: Recording) -> Samples:
 
 
 def tracked_position(optical: Optical, recording: Recording) -> Floats:
-    """The tracker's position (N, 3), or an error that names the run where it has attitude only."""
+    """The tracker's position (N, 3), m, reference frame; an error if it reports attitude only."""
     if optical.position is None:
         raise RecordingError(
             recording.path or recording.name,
@@ -67,6 +68,9 @@ def tracked_position(optical: Optical, recording: Recording) -> Floats:
     return optical.position
 
 
-def turned(q_ref_body: Floats, vector: Floats) -> Floats:
+def rotated_to_reference(q_ref_body: Floats, vector: Floats) -> Floats:
     """A body vector (3,) in the reference frame at each of the attitudes (N, 4)."""
     return to_scipy(q_ref_body).apply(vector)
+
+
+__getattr__ = renamed(__name__, "turned>rotated_to_reference")

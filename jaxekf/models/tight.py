@@ -1,8 +1,13 @@
-"""`tight`: every visible marker by itself, at the time it was seen, with the IMU as input.
+"""`tight`: pose, velocity and IMU biases from single markers and an IMU, tightly coupled.
 
-The tightly coupled filter of Tobergte, Pomarlan, Hirzinger (2009), eqs. 16 to 23: with two markers, one,
-or for a while none, the pose is still known. The model has one sensor of three rows for each marker; see
-`jaxekf.models.inertial` for the state.
+Choose it for a tracker that reports single markers: with two visible markers, one, or for a while none, the
+pose is still estimated. It is the filter of Tobergte, Pomarlan, Hirzinger (2009), eqs. 16 to 23; each
+marker is a sensor of its own, used at the time of its measurement.
+
+- States (15 degrees of freedom), input, calibration and initial deviations: those of `inertial`.
+- Sensors: `marker_NAME` for each marker, its position (m, reference frame; eq. 23).
+- Noise: `gyroscope` rad/s/sqrt(Hz), `accelerometer` m/s^2/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `accelerometer_walk` m/s^3/sqrt(Hz), `marker` m.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import Euclidean
@@ -24,7 +30,7 @@ GATE = 0.999
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     gyroscope: Any
     accelerometer: Any
@@ -32,29 +38,29 @@ class Noise(NamedTuple):
     """Random walk of the gyroscope's bias."""
     accelerometer_walk: Any
     marker: Any
-    """A marker's position, standard deviation of a sample, reference frame; a reported fit error adds
-    to it."""
+    """Standard deviation of a sample of a marker's position, reference frame; a reported fit error is
+    added."""
 
 
 class Setup(NamedTuple):
-    """What a recording tells of its run; fields as in `inertial.Setup`."""
+    """Constants of a recording; further fields as in `inertial.Setup`."""
 
     gravity_ref: Any
     p_body_object: Any
     q_body_object: Any
     p_body_marker: Any
-    """(M, 3) metres: the markers, in the order of the model's sensors."""
+    """(M, 3) metres: the markers in the body frame, in the order of the model's sensors."""
 
 
 def arm(index: int, params: Parameters) -> Array:
-    """Where a marker is in the body (3,), metres."""
-    said = params.setup.p_body_marker[index]
-    turned = rotation.rotate(rotation.exp(params.calibration.alignment), said)
-    return params.calibration.lever_arm + turned
+    """Position of a marker in the body frame (3,), m."""
+    stated = params.setup.p_body_marker[index]
+    rotated = rotation.rotate(rotation.exp(params.calibration.alignment), stated)
+    return params.calibration.lever_arm + rotated
 
 
 def _predict(index: int, x: inertial.State, u: Any, params: Parameters, aux: Any) -> Array:
-    """Eq. 23: the body's origin and the marker's arm turned into the reference frame."""
+    """Eq. 23: the body's position plus the marker's arm, in the reference frame, (3,) m."""
     return x.position + rotation.rotate(x.q_ref_body, arm(index, params))
 
 
@@ -69,7 +75,7 @@ def sensor_name(marker: str) -> str:
 
 
 def _source(name: str, recording: Recording) -> Samples:
-    """A marker's positions (N, 3); masked everywhere where the recording does not have the marker."""
+    """A marker's positions (N, 3); masked everywhere if the recording does not have the marker."""
     markers = sources.single_markers(recording)
     count = len(markers.time_ns)
     taken = markers.time_ns - markers.latency_ns
@@ -86,13 +92,13 @@ def _source(name: str, recording: Recording) -> Samples:
 def _setup(names: tuple[str, ...], recording: Recording) -> Setup:
     markers = sources.single_markers(recording)
     places = dict(zip(markers.names, markers.p_body_marker, strict=True))
-    # A marker that this recording does not have is never seen: any place will do.
+    # A marker that this recording does not have is always masked: its place does not matter.
     arms = np.array([places.get(name, np.zeros(3)) for name in names], float)
     return Setup(*inertial.setup(recording, partial(marker_pose.from_markers, markers)), arms)
 
 
 def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | None:
-    """The first frame in which three markers, not on a line, give a pose; what came before is dropped."""
+    """The first frame whose markers give a pose (three, not collinear); earlier samples are dropped."""
     times = next(iter(samples.values())).time_ns
     markers = sources.single_markers(recording)
     fit = marker_pose.fit_markers(markers, recording.path or recording.name)
@@ -108,7 +114,7 @@ def find_start(recording: Recording, samples: Mapping[str, Samples]) -> Start | 
     note = ""
     if waited > 0.0:
         note = (
-            f"waited {waited:.3f} s for a frame with three markers, not on a line, to start from;"
+            f"waited {waited:.3f} s for a frame with three markers, not collinear, to start from;"
             f" {int((taken[inside] < taken[first]).sum())} frames before it are not used"
         )
     known = {
@@ -146,12 +152,12 @@ def _sensor(index: int, name: str) -> Sensor:
 
 
 L_SHAPE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
-"""The tool of the paper: markers on an L with legs of 10 cm, the IMU at its corner."""
+"""The paper's tool: markers on an L with legs of 10 cm, the IMU at its corner."""
 
 DEFAULTS = Parameters(
     Noise(
         gyroscope=np.deg2rad(0.05),
-        accelerometer=1.85e-3 * 9.80665,
+        accelerometer=1.85e-3 * STANDARD_GRAVITY,
         bias_walk=np.deg2rad(0.002),
         accelerometer_walk=1e-3,
         marker=0.25e-3,
@@ -190,4 +196,4 @@ def _build(names: tuple[str, ...], params: Parameters) -> Model:
 
 
 MODEL = for_markers(("1", "2", "3"))
-"""For three markers; `adapt` makes the one that a recording needs."""
+"""The model for three markers; `adapt` makes the one for a recording."""

@@ -1,29 +1,35 @@
-"""`triad`: attitude and rate bias, the attitude measured from gravity and the magnetic field.
+"""`triad`: attitude and rate bias from gravity, the magnetic field and a rate of any source.
 
-Ang, Khosla, Riviere, eqs. 19 to 51: the rate of any source (an array of accelerometers, see
-`jaxekf.pose_solvers.gyro_free_rate`, or a gyroscope) drives the prediction, and an attitude found from
-specific force and magnetic field (`jaxekf.geometry.triad.triad`, eqs. 7 to 13) corrects it, with the
-covariance of eqs. 41 to 46. The state has 7 numbers and 6 degrees of freedom. `marg` serves better
-where the body accelerates.
+Choose it to reproduce Ang, Khosla, Riviere (eqs. 19 to 51), or for a body that hardly accelerates; `marg`
+is better for one that does. The rate (of an accelerometer array, see `jaxekf.pose_solvers.gyro_free_rate`,
+or of a gyroscope) drives the prediction; an attitude from specific force and magnetic field
+(`jaxekf.geometry.triad.triad`, eqs. 7 to 13) corrects it, with the covariance of eqs. 41 to 46.
 
-What is wrong in print, and otherwise here: eqs. 21 and 24 disagree in the quaternion's order; eqs. 28, 30
-and 31 lack the factor T; eq. 47 subtracts the bias twice; eq. 46 has rank 3, so that the error of three
-components is taken. All is by derivation from ``q exp((rate - bias) dt)``.
+Corrections of the print: eqs. 21 and 24 disagree in the quaternion's order; eqs. 28, 30 and 31 lack the
+factor T; eq. 47 subtracts the bias twice; eq. 46 has rank 3, so the error has three components. The model
+derives everything from ``q exp((rate - bias) dt)``.
+
+- States (6 degrees of freedom): `q_ref_body` (error: rad, body frame), `bias` rad/s.
+- Input: rate, rad/s, body frame.
+- Sensor: `attitude`, from accelerometer and magnetometer.
+- Noise: `rate` rad/s/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz), `accelerometer` m/s^2, `magnetometer` 1.
+- Calibration: `clock_offset` s.
+- Initial: `attitude` rad, `bias` rad/s.
 """
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.interpolation import InputSample
-from jaxekf.filtering.model import Input, Model, Output, Parameters, Sensor
-from jaxekf.geometry import linalg, rotation, triad
+from jaxekf.filtering.model import Input, Model, Parameters, Sensor
+from jaxekf.geometry import linalg, triad
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.models import _earth as earth
-from jaxekf.models import inertial, loose, sources
+from jaxekf.models import _outputs, inertial, loose, sources
 from jaxekf.pose_solvers import tilt
 from jaxekf.recordings.types import Recording, Samples
 
@@ -36,36 +42,36 @@ class State(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What is random: each leaf of shape (), (3,) or a lower-triangular factor (3, 3)."""
+    """Noise parameters: each of shape (), (3,) or a lower-triangular factor (3, 3)."""
 
     rate: Any
     """White noise of the rate, spectral density."""
     bias_walk: Any
     """Random walk of the bias, spectral density of its derivative."""
     accelerometer: Any
-    """Specific force, standard deviation of a sample: by what it is not gravity."""
+    """Standard deviation of a specific-force sample from gravity, accelerations of the body included."""
     magnetometer: Any
-    """The field, standard deviation of a sample, share of its norm."""
+    """Standard deviation of a field sample, share of its norm."""
 
 
 class Calibration(NamedTuple):
-    """What is not random."""
+    """Deterministic parameters."""
 
     clock_offset: Any
-    """Seconds to add to the attitude's time to get the rate's, positive where the rate lags; ()."""
+    """Seconds to add to the attitude's time to get the rate's, positive if the rate lags; ()."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     attitude: Any
-    """About the first attitude, which is then used as a measurement: keep it wide."""
+    """About the first attitude, which is then used as a measurement, too: keep it large."""
     bias: Any
     """About zero."""
 
 
 class Readings(NamedTuple):
-    """What an attitude was found from."""
+    """The two vectors from which an attitude is computed."""
 
     force: Any
     """(3,) m/s^2."""
@@ -88,7 +94,7 @@ def process_noise(params: Parameters, dt: Array) -> Array:
 
 
 def predict_attitude(x: State, u: InputSample, params: Parameters, aux: Any) -> Array:
-    """The attitude itself."""
+    """The attitude (4,), which the sensor measures directly."""
     return x.q_ref_body
 
 
@@ -101,10 +107,10 @@ def attitude_noise(params: Parameters, aux: Readings, dt: Array) -> Array:
 
 
 def attitude(recording: Recording) -> Samples:
-    """Attitudes (N, 4) of each pair of readings; parallel vectors and what was not read are masked."""
-    imu, about = earth.need_both(recording), earth.setup(recording)
+    """Attitudes (N, 4) of each pair of readings; parallel vectors and missing readings are masked."""
+    imu, about = earth.require_marg_imu(recording), earth.setup(recording)
     assert imu.accelerometer is not None and imu.magnetometer is not None
-    norm = np.nanmedian(tilt.field(imu).norm)
+    norm = np.nanmedian(tilt.magnetic_field(imu).norm)
     force, field = imu.accelerometer, imu.magnetometer / norm
     found = earth.attitudes(force, field, about)
     valid = np.asarray(found.valid) & np.isfinite(field).all(axis=1)
@@ -113,10 +119,9 @@ def attitude(recording: Recording) -> Samples:
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """The first attitude (the identity if there is none) and no bias."""
-    seen = first.get("attitude")
-    q = rotation.identity() if seen is None else rotation.normalise(jnp.asarray(seen))
-    return State(q, jnp.zeros(3, q.dtype))
+    """The first attitude (the identity without any) and zero bias."""
+    q, _, bias = loose.first_values(first, "attitude")
+    return State(q, bias)
 
 
 DEFAULTS = Parameters(
@@ -149,7 +154,7 @@ MODEL = Model(
             predict_attitude,
             attitude_noise,
             attitude,
-            aux_like=Readings(np.array([0.0, 0.0, 9.80665]), np.array([0.0, 0.5, -0.866])),
+            aux_like=Readings(np.array([0.0, 0.0, STANDARD_GRAVITY]), np.array([0.0, 0.5, -0.866])),
         ),
     ),
     parameters=DEFAULTS,
@@ -160,11 +165,8 @@ MODEL = Model(
     start_with=("attitude",),
     input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
     outputs=(
-        Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-        Output(
-            "rate",
-            Euclidean(3, "rad/s"),
-            "body",
+        _outputs.ATTITUDE,
+        _outputs.rate(
             lambda x, u, params: u.value - x.bias,
             lambda u, params: linalg.covariance(params.noise.rate, 3) * u.bandwidth,
         ),

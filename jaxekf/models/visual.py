@@ -1,13 +1,24 @@
-"""`visual`: pose from landmarks in images and an IMU, both of them measurements.
+"""`visual`: pose, velocity and IMU biases from landmarks in images and an IMU, both as measurements.
 
-The filter of Hol (2008): 22 numbers, 21 degrees of freedom, eqs. 9 (process), 11a (accelerometer), 11b
-(gyroscope) and 3a or 11c (point correspondences). The state carries acceleration and rate, which are
-random walks here with spectral densities; so images and IMU may come at any rates, and either may fail.
+Choose it for a camera that sees known landmarks. It is the filter of Hol (2008), eqs. 9 (process), 11a
+(accelerometer), 11b (gyroscope) and 3a or 11c (point correspondences). Acceleration and rate are states,
+random walks with spectral densities here, so images and IMU may come at any rates, and either may fail.
 
-A camera's sample has one group of two rows for each of as many landmarks as an image has at most; see
-`jaxekf.filtering.model.repeated`. The measurement is the image point itself (reprojection).
-`visual_bilinear` has the thesis' 11c: ``0 = (I, -z) p_camera``, in metres, z the direction of the image
-point; there the point goes into the slope, and its depth into the noise.
+- States (21 degrees of freedom): `position` m, `velocity` m/s, `acceleration` m/s^2 (reference frame),
+  `q_ref_body` (error: rad, body frame), `rate` rad/s (body frame), `bias` rad/s,
+  `accelerometer_bias` m/s^2.
+- Input: none.
+- Sensors: `accelerometer`, `gyroscope`, and `camera` with two rows for each of as many landmarks as an
+  image has at most, see `jaxekf.filtering.model.repeated`.
+- Noise: `jerk` m/s^3/sqrt(Hz), `angular_acceleration` rad/s^2/sqrt(Hz), `bias_walk` rad/s^2/sqrt(Hz),
+  `accelerometer_walk` m/s^3/sqrt(Hz), `gyroscope` rad/s/sqrt(Hz), `accelerometer` m/s^2/sqrt(Hz),
+  `pixel` px.
+- Calibration: `lever_arm` m, `alignment` rad, `focal` 1, `centre` px, `radial` 1, `latency` s.
+- Initial: one standard deviation for each state, in its unit.
+
+The measurement is the image point (reprojection, eq. 3a). `visual_bilinear` has the thesis' eq. 11c,
+``0 = (I, -z) p_camera``, in metres, z the direction of the image point; choose it only for comparison, as
+the point enters the slope there, and its depth the noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,19 +30,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxekf.filtering.model import Model, Output, Parameters, Sensor, repeated
+from jaxekf._support.constants import GRAVITY_REF
+from jaxekf._support.deprecations import renamed
+from jaxekf.filtering.model import Model, Parameters, Sensor, repeated
 from jaxekf.geometry import linalg, pinhole, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.geometry.pinhole import Lens
 from jaxekf.models import _correspondences as correspondences
-from jaxekf.models import inertial, sources
-from jaxekf.models._correspondences import Point, SeenPoint
+from jaxekf.models import _outputs, inertial, sources
+from jaxekf.models._correspondences import BilinearPoint, Point
 from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.types import Recording, Samples
 
 GATE = 0.999
 _FEWEST = 8
-"""Groups of an image that a model has at least; it has a multiple of them, so that few are compiled."""
+"""Groups of an image come in multiples of this number, so that few models are compiled."""
 
 
 class State(NamedTuple):
@@ -44,12 +57,12 @@ class State(NamedTuple):
     rate: Any
     """Body frame."""
     bias: Any
-    """Of the gyroscope."""
+    """Gyroscope bias, rad/s, body frame."""
     accelerometer_bias: Any
 
 
 class Noise(NamedTuple):
-    """What is random: leaves of shape (), (3,) or (3, 3), but for `pixel`, ()."""
+    """Noise parameters: of shape (), (3,) or (3, 3), but for `pixel`, ()."""
 
     jerk: Any
     """Random walk of the acceleration, reference frame."""
@@ -60,32 +73,32 @@ class Noise(NamedTuple):
     gyroscope: Any
     accelerometer: Any
     pixel: Any
-    """Standard deviation of an image point in each direction; a reported one adds to it."""
+    """Standard deviation of an image point per axis; a reported one is added."""
 
 
 class Calibration(NamedTuple):
-    """Corrections of what a recording states of its camera."""
+    """Deterministic parameters: corrections of the camera's stated parameters."""
 
     lever_arm: Any
-    """Metres from where the camera is said to be in the body to where it is, body frame; (3,)."""
+    """Correction of the camera's position in the body, m, body frame; (3,)."""
     alignment: Any
-    """Rotation vector from the camera's frame as it is said to be to what it is, camera frame; (3,)."""
+    """Rotation vector from the stated to the actual camera frame, rad, camera frame; (3,)."""
     focal: Any
     """Factors of the focal lengths; (2,)."""
     centre: Any
-    """Pixels to add to the image point of the axis; (2,)."""
+    """Correction of the principal point, pixels; (2,)."""
     radial: Any
-    """To add to the radial distortion; (2,)."""
+    """Correction of the radial distortion; (2,)."""
     latency: Any
-    """Seconds that images are older than they are said to be; ()."""
+    """Seconds by which images are older than stated; ()."""
 
 
 class Initial(NamedTuple):
-    """Standard deviations of the belief a run starts from."""
+    """Standard deviations of the initial state."""
 
     position: Any
-    """About the pose of the first image, which is then used as a measurement: keep it and the attitude
-    wide, but not so wide that mismatches fit."""
+    """About the pose of the first image, which is then used as a measurement, too: keep it and the attitude
+    large, but not so large that mismatches fit."""
     velocity: Any
     acceleration: Any
     attitude: Any
@@ -95,10 +108,10 @@ class Initial(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What a recording tells of its run."""
+    """Constants of a recording."""
 
     gravity_ref: Any
-    """(3,) free fall in the scene, m/s^2."""
+    """(3,) gravity vector in the scene, m/s^2."""
     focal: Any
     centre: Any
     radial: Any
@@ -120,18 +133,18 @@ SPACE: Any = State(
 
 
 def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
-    """Eqs. 9: position, velocity and attitude carried on, all else a random walk.
+    """Eqs. 9: position, velocity and attitude are integrated, the other states are random walks.
 
-    ``w`` holds the changes of acceleration, rate and both biases. What they add to position, velocity and
-    attitude on the way is that of a change at a constant speed.
+    ``w`` holds the changes of acceleration, rate and both biases. Their effect on position, velocity and
+    attitude during the step is that of a change at constant speed.
     """
-    jump, swing = w[:3], w[3:6]
+    acceleration_change, rate_change = w[:3], w[3:6]
     return State(
-        x.position + (x.velocity + (x.acceleration / 2.0 + jump / 6.0) * dt) * dt,
-        x.velocity + (x.acceleration + jump / 2.0) * dt,
-        x.acceleration + jump,
-        SO3().retract(x.q_ref_body, (x.rate + swing / 2.0) * dt),
-        x.rate + swing,
+        x.position + (x.velocity + (x.acceleration / 2.0 + acceleration_change / 6.0) * dt) * dt,
+        x.velocity + (x.acceleration + acceleration_change / 2.0) * dt,
+        x.acceleration + acceleration_change,
+        SO3().retract(x.q_ref_body, (x.rate + rate_change / 2.0) * dt),
+        x.rate + rate_change,
         x.bias + w[6:9],
         x.accelerometer_bias + w[9:],
     )
@@ -140,34 +153,30 @@ def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> Sta
 def process_noise(params: Parameters, dt: Array) -> Array:
     """Covariance (12, 12) of the changes of acceleration, rate, and both biases over ``dt``."""
     noise = params.noise
-    densities = (
-        noise.jerk,
-        noise.angular_acceleration,
-        noise.bias_walk,
-        noise.accelerometer_walk,
+    return dt * linalg.block_covariance(
+        (noise.jerk, noise.angular_acceleration, noise.bias_walk, noise.accelerometer_walk)
     )
-    return dt * inertial.block_diagonal([linalg.covariance(d, 3) for d in densities])
 
 
 def predict_gyroscope(x: State, u: Any, params: Parameters, aux: Any) -> Array:
-    """Eq. 11b."""
+    """Eq. 11b: rate plus bias (3,), rad/s."""
     return x.rate + x.bias
 
 
 def predict_accelerometer(x: State, u: Any, params: Parameters, aux: Any) -> Array:
-    """Eq. 11a: what acceleration and gravity are in the body."""
+    """Eq. 11a: acceleration minus gravity in the body frame, plus bias (3,), m/s^2."""
     force = x.acceleration - params.setup.gravity_ref
     return rotation.rotate_inverse(x.q_ref_body, force) + x.accelerometer_bias
 
 
 def lens_of(params: Parameters) -> Lens:
-    """The camera's lens as stated and corrected."""
+    """The camera's intrinsic parameters, corrected."""
     setup, more = params.setup, params.calibration
     return Lens(setup.focal * more.focal, setup.centre + more.centre, setup.radial + more.radial)
 
 
 def in_camera(x: State, params: Parameters, p_ref_landmark: Array) -> Array:
-    """Eq. 3b: a landmark (3,) in the camera's frame, metres, when the image was taken."""
+    """Eq. 3b: a landmark (3,) in the camera frame, m, at the time of the image."""
     setup, more = params.setup, params.calibration
     back = -more.latency
     position = x.position + (x.velocity + 0.5 * x.acceleration * back) * back
@@ -187,14 +196,14 @@ def point_noise(params: Parameters, aux: Point, dt: Array) -> Array:
     return (params.noise.pixel**2 + aux.sigma**2) * jnp.eye(2)
 
 
-def predict_bilinear(x: State, u: Any, params: Parameters, aux: SeenPoint) -> Array:
-    """Eq. 11c: how far (2,), metres, the landmark lies off the ray of its image point, beside the axis."""
+def predict_bilinear(x: State, u: Any, params: Parameters, aux: BilinearPoint) -> Array:
+    """Eq. 11c: offset (2,), m, of the landmark from the ray of its image point."""
     p = in_camera(x, params, aux.p_ref_landmark)
     return p[:2] - pinhole.ray(lens_of(params), aux.pixel) * p[2]
 
 
-def bilinear_noise(params: Parameters, aux: SeenPoint, dt: Array) -> Array:
-    """Covariance (2, 2), metres squared: that of the image point at the landmark's depth."""
+def bilinear_noise(params: Parameters, aux: BilinearPoint, dt: Array) -> Array:
+    """Covariance (2, 2), m^2: that of the image point at the landmark's depth."""
     slope = jax.jacfwd(partial(pinhole.ray, lens_of(params)))(aux.pixel)
     variance = params.noise.pixel**2 + aux.sigma**2
     return variance * aux.depth**2 * linalg.multiply_transposed(slope, slope)
@@ -211,7 +220,7 @@ def accelerometer(recording: Recording) -> Samples:
 
 
 def setup(recording: Recording) -> Setup:
-    """The camera as stated, and gravity: stated, or found from images and accelerometer."""
+    """The camera as stated, and gravity: stated, or estimated from images and accelerometer."""
     stream = recording.need_camera()
     turn = np.asarray(stream.q_body_camera, float)
     return Setup(
@@ -225,7 +234,7 @@ def setup(recording: Recording) -> Setup:
 
 
 def initial_mean(first: Mapping[str, Any]) -> State:
-    """What was found at the start (at the origin, at rest, where it was not), no biases."""
+    """State of the start (at rest at the origin without one), zero biases."""
     zero = jnp.zeros(3)
     return State(
         jnp.asarray(first.get("position", zero)),
@@ -239,7 +248,7 @@ def initial_mean(first: Mapping[str, Any]) -> State:
 
 
 def adapt(bilinear: bool, recordings: Sequence[Recording]) -> Model:
-    """The model for as many landmarks as an image of these recordings has at most."""
+    """The model for the largest number of landmarks in an image of these recordings."""
     most = max((int(r.need_camera().usable.sum(axis=1).max()) for r in recordings), default=1)
     return for_points(-(-max(most, 1) // _FEWEST) * _FEWEST, bilinear)
 
@@ -278,7 +287,7 @@ DEFAULTS = Parameters(
         accelerometer_bias=0.2,
     ),
     Setup(
-        np.array(inertial.STANDARD_GRAVITY),
+        np.array(GRAVITY_REF),
         np.array([213.0, 213.0]),
         np.array([160.0, 120.0]),
         np.zeros(2),
@@ -302,20 +311,10 @@ UNITS = Parameters(
 )
 
 OUTPUTS = (
-    Output(
-        "position",
-        Euclidean(3, "m", frame="reference"),
-        "reference",
-        lambda x, u, params: x.position,
-    ),
-    Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
-    Output(
-        "velocity",
-        Euclidean(3, "m/s", frame="reference"),
-        "reference",
-        lambda x, u, params: x.velocity,
-    ),
-    Output("rate", Euclidean(3, "rad/s"), "body", lambda x, u, params: x.rate),
+    _outputs.POSITION,
+    _outputs.ATTITUDE,
+    _outputs.VELOCITY,
+    _outputs.rate(lambda x, u, params: x.rate),
 )
 
 
@@ -324,7 +323,7 @@ def _point(count: int, bilinear: bool) -> Sensor:
     place = np.array([0.0, 0.0, 2.0])
     like: Any = Point(place, 0.0)
     if bilinear:
-        like = SeenPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
+        like = BilinearPoint(place, 0.0, np.array([160.0, 120.0]), 2.0)
     return Sensor(
         "camera",
         Euclidean(2, "m" if bilinear else "px"),
@@ -375,5 +374,8 @@ def _build(count: int, bilinear: bool) -> Model:
 
 
 MODEL = for_points(_FEWEST)
-"""For eight landmarks in an image; `adapt` makes the one that a recording needs."""
+"""The model for eight landmarks in an image; `adapt` makes the one for a recording."""
 BILINEAR = for_points(_FEWEST, True)
+
+
+__getattr__ = renamed(__name__, "SeenPoint>BilinearPoint")

@@ -1,7 +1,8 @@
-"""Poses, tilt and rate of one instant by themselves, on the host: no filter and no history.
+"""Poses, tilt and angular rate of single instants, without a filter.
 
-All modules are public. A new solver is a file here; a model uses it in its `find_start` or as a
-pseudo-measurement.
+`marker_pose` solves poses from markers, `pnp` from image points, `tilt` the vertical from an IMU, and
+`gyro_free_rate` the rate from an `accelerometer_array`. All modules are public. A new solver is a file
+here; a model uses it in its `find_start` or as a pseudo-measurement.
 """
 
 from jaxekf._support.lazy import attributes

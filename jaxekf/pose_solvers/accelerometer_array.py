@@ -1,9 +1,9 @@
-"""Accelerometers at known places of a rigid body, and what their differences tell of its rotation.
+"""Accelerometer array: differences of single-axis accelerometers at known places of a rigid body.
 
-The axis ``s`` at the place ``p`` reads ``s . (a + alpha x p + omega x (omega x p))``: ``a`` is the
-specific force at the body's origin, the rest is the rigid-body law. The three numbers of ``a`` are
-removed by projection onto what no ``a`` can reach, which for the paper's three dual-axis chips are its
-three differences ``A_D`` (Ang, Khosla, Riviere, eqs. 1 to 6) and else whatever the axes allow.
+An axis ``s`` at the place ``p`` reads ``s . (a + alpha x p + omega x (omega x p))``: ``a`` is the specific
+force at the body's origin, the rest is rigid-body motion. A projection onto the orthogonal complement of
+the axes removes ``a``. For the paper's three dual-axis chips it gives their three differences ``A_D``
+(Ang, Khosla, Riviere, eqs. 1 to 6), and for other arrays as many as the axes allow.
 """
 
 from typing import NamedTuple
@@ -19,37 +19,42 @@ _RANK = 1e-6
 
 
 class AccelerometerArray(NamedTuple):
-    """Places and directions of single accelerometer axes, all in the body frame."""
+    """Places and directions of single accelerometer axes, body frame."""
 
     positions: Array
-    """Place of each axis (n, 3), m."""
+    """(n, 3) place of each axis, m."""
     axes: Array
-    """Sensitive direction of each axis (n, 3), unit vectors."""
+    """(n, 3) sensitive direction of each axis, unit vectors."""
 
 
 class Differences(NamedTuple):
-    """What is left of the rigid-body law once the specific force is gone, in units of the noise.
+    """Whitened readings without the specific force, as functions of the angular motion.
 
-    ``whitening @ readings = linear @ alpha + (omega' quadratic omega)``, plus noise of covariance one.
+    ``whitening @ readings = linear @ alpha + (omega' quadratic omega)``, plus noise of unit covariance.
     """
 
     whitening: Array
-    """Takes n readings, m/s^2, to their whitened, projected form (n, n)."""
+    """(n, n), takes readings, m/s^2, to their whitened, projected form."""
     linear: Array
-    """The paper's matrix M (n, 3), per rad/s^2."""
+    """(n, 3) per rad/s^2, the paper's matrix M."""
     quadratic: Array
-    """Symmetric matrix of the centripetal part of each row (n, 3, 3), per (rad/s)^2."""
+    """(n, 3, 3) per (rad/s)^2, symmetric matrices of the centripetal terms."""
     independent: Array
-    """How many independent differences there are, (): n less the rank of the axes."""
+    """Number of independent differences, (): n minus the rank of the axes."""
     degenerate: Array
-    """Whether they leave part of the angular acceleration unknown, (): rank of `linear` below 3."""
+    """Whether the angular acceleration is not fully determined, (): rank of `linear` below 3."""
 
 
 def three_dual_axis(first: Array, second: Array, third: Array) -> AccelerometerArray:
-    """The paper's array: chips at `first` (x, z), `second` (y, z) and `third` (x, y), each (3,), m.
+    """The paper's array of three dual-axis chips.
 
     Readings are in the order ``1x 1z 2y 2z 3x 3y``. With ``P_ij`` from chip i to chip j, the array is
-    degenerate where ``det M = P13z P23x P12y - P13y P23z P12x`` is zero.
+    degenerate if ``det M = P13z P23x P12y - P13y P23z P12x`` is zero.
+
+    Parameters
+    ----------
+    first, second, third
+        (3,) m, places of the chips with the axes (x, z), (y, z) and (x, y), body frame.
     """
     x, y, z = jnp.eye(3)
     places = jnp.stack([first, first, second, second, third, third])
@@ -59,10 +64,18 @@ def three_dual_axis(first: Array, second: Array, third: Array) -> AccelerometerA
 def exact_readings(
     array: AccelerometerArray, rate: Array, angular_acceleration: Array, force: Array
 ) -> Array:
-    """Readings (n,), m/s^2, without noise.
+    """Noise-free readings (n,), m/s^2.
 
-    `rate` (3,), rad/s, `angular_acceleration` (3,), rad/s^2, and the specific force at the origin
-    `force` (3,), m/s^2, in the body frame.
+    Parameters
+    ----------
+    array
+        The array.
+    rate
+        (3,) rad/s, body frame.
+    angular_acceleration
+        (3,) rad/s^2, body frame.
+    force
+        (3,) m/s^2, specific force at the origin, body frame.
     """
 
     def read(position: Array, axis: Array) -> Array:
@@ -74,10 +87,11 @@ def exact_readings(
 
 
 @jax.custom_jvp
-def _left_out(matrix: Array) -> tuple[Array, Array]:
-    """Projector (n, n) onto what the columns of `matrix` (n, 3) do not reach, and its inverse (3, n).
+def _complement_projector(matrix: Array) -> tuple[Array, Array]:
+    """Projector (n, n) onto the complement of the columns of `matrix` (n, 3), and the pseudo-inverse (3,
+    n).
 
-    Columns that depend on the others count as not there.
+    Dependent columns are left out.
     """
     u, size, vt = jnp.linalg.svd(matrix, full_matrices=False)
     there = size > _RANK * size[0]
@@ -86,16 +100,16 @@ def _left_out(matrix: Array) -> tuple[Array, Array]:
     return jnp.eye(matrix.shape[0], dtype=matrix.dtype) - u @ u.T, inverse
 
 
-@_left_out.defjvp
-def _left_out_jvp(
+@_complement_projector.defjvp
+def _complement_projector_jvp(
     primals: tuple[Array], tangents: tuple[Array]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Golub and Pereyra (1973): needs no derivative of singular vectors, which equal sizes do not have.
+    """Derivative by Golub and Pereyra (1973), without derivatives of singular vectors, which may not exist.
 
-    A rank below three is kept: a direction of the force that no axis feels stays without effect.
+    A rank below three is kept: a direction of the force that no axis measures stays without effect.
     """
     (matrix,), (change,) = primals, tangents
-    projector, inverse = _left_out(matrix)
+    projector, inverse = _complement_projector(matrix)
     moved = projector @ change @ inverse
     unreached = jnp.eye(3, dtype=matrix.dtype) - inverse @ matrix
     slope = (
@@ -107,11 +121,23 @@ def _left_out_jvp(
 
 
 def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
-    """Prepare an array for `differential`; once for all samples.
+    """Prepare an array for `gyro_free_rate.angular_rate`; once for all samples.
 
-    `noise`, m/s^2, of one sample: one standard deviation (), one for each axis (n,), or a
-    lower-triangular factor of the covariance (n, n). Differentiable by everything. Any n will do: what
-    too few axes cannot tell is flagged.
+    The result is differentiable by all arguments. Any number of axes is allowed; an array with too few is
+    flagged as degenerate.
+
+    Parameters
+    ----------
+    array
+        The array.
+    noise
+        Noise of one sample, m/s^2: standard deviation of all axes (), of each axis (n,), or a
+        lower-triangular factor of the covariance (n, n).
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
     """
     positions, axes = jnp.asarray(array.positions), jnp.asarray(array.axes)
     if positions.ndim != 2 or positions.shape[1] != 3 or axes.shape != positions.shape:
@@ -124,7 +150,7 @@ def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
     unprojected = jax.scipy.linalg.solve_triangular(
         factor, jnp.eye(n, dtype=axes.dtype), lower=True
     )
-    projector, inverse = _left_out(unprojected @ axes)
+    projector, inverse = _complement_projector(unprojected @ axes)
     whitening = projector @ unprojected
     outer = axes[:, :, None] * positions[:, None, :]
     trace = jnp.sum(axes * positions, axis=1)[:, None, None]

@@ -1,13 +1,14 @@
-"""Angular velocity from the differences of accelerometers on one rigid body, without a gyroscope.
+"""Angular rate from the differences of accelerometers on one rigid body, without a gyroscope.
 
-Ang, Khosla, Riviere, eqs. 1 to 6, for any number and placement of axes (`placement`). The angular
-acceleration is eq. 3's backward difference with the rate before known, ``alpha = (omega(t) -
-omega(t - T)) / T``, which leaves ``omega(t)`` as three unknowns whose residuals are quadratic.
+The method is that of Ang, Khosla, Riviere, eqs. 1 to 6, for any number and placement of axes
+(`accelerometer_array`). The angular acceleration is eq. 3's backward difference with the previous rate,
+``alpha = (omega(t) - omega(t - T)) / T``, so ``omega(t)`` is three unknowns with quadratic residuals.
 
-The rate is integrated, so its error is too: it goes on by `RateEstimate.transition` at each sample,
-which grows or decays with rate and geometry: with six axes and rates of 20 rad/s by many powers of
-ten in seconds, with twelve by far less. Something else, such as an attitude, must bound it, or
-the rate is led back to zero as it goes (`forget_s` of `track`).
+The rate is an integral, and its error is integrated, too: each sample multiplies it by
+`RateEstimate.transition`, which grows or decays with rate and geometry. With six axes and rates of 20 rad/s
+it grows by many powers of ten within seconds, with twelve axes by far less. Another measurement, such as an
+attitude, must bound the error, or the rate decays to zero with a time constant (`forget_s` of `track`).
+`restored` adds the forgotten part again.
 """
 
 from typing import NamedTuple
@@ -35,30 +36,30 @@ _AS_FAR = 10.0
 
 
 class RateEstimate(NamedTuple):
-    """Angular velocity at one sample, in the body frame; `track` puts samples on the first axis."""
+    """Angular rate at one sample, body frame; `track` has samples on the first axis."""
 
     rate: Array
-    """Angular velocity (3,), rad/s."""
+    """(3,) rad/s."""
     covariance: Array
-    """Its covariance (3, 3), (rad/s)^2, to first order; of `rate` given the one before, unless that
-    one's covariance was given."""
+    """(3, 3), (rad/s)^2, to first order; conditional on the previous rate unless its covariance was
+    given."""
     transition: Array
-    """Derivative (3, 3) of `rate` by the rate one interval before, for small residuals."""
+    """Derivative (3, 3) of `rate` by the previous rate, for small residuals."""
     cost: Array
-    """Sum of squared residuals in units of the noise, (); `Differences.independent` less 3 on average."""
+    """Sum of squared residuals in units of the noise, (); its mean is `Differences.independent` minus 3."""
     degenerate: Array
-    """The array cannot tell all of the angular acceleration, wherever it is at, ()."""
+    """Whether the array does not determine the angular acceleration, at any rate, ()."""
     singular: Array
-    """At this rate the readings do not determine it, to first order, ()."""
+    """Whether the readings do not determine this rate to first order, ()."""
     ambiguous: Array
-    """Another rate fits as well, (): the opposite one, where the angular acceleration is too small a
-    part of the readings to tell their sign, or one not much further from the rate before."""
+    """Whether another rate fits as well, (): the opposite one, if the angular acceleration is too small to
+    determine the sign, or one not much farther from the previous rate."""
     converged: Array
-    """Whether the search came to an end, ()."""
+    """Whether the search converged, ()."""
 
     @property
     def valid(self) -> Array:
-        """Whether none of the flags speaks against the rate."""
+        """Whether the search converged and no flag is set."""
         return self.converged & ~(self.degenerate | self.singular | self.ambiguous)
 
 
@@ -69,12 +70,23 @@ def angular_rate(
     interval: Array | float,
     covariance_before: Array | None = None,
 ) -> RateEstimate:
-    """The angular velocity that explains one sample of an array, nearest to the one before.
+    """Angular rate that explains one sample of an array, nearest to the previous rate.
 
-    `readings` (n,), m/s^2, of the axes in the order of the array; `rate_before` (3,), rad/s, one
-    `interval` () in s earlier, with its covariance (3, 3) or None for exactly known. Differentiable by
-    every number given, forward and reverse, and finite also where flags are raised. An `interval` of
-    infinity leaves the angular acceleration out: then two opposite rates fit and `ambiguous` is set.
+    The result is differentiable by all arguments, forward and reverse, and finite also if a flag is set.
+
+    Parameters
+    ----------
+    prepared
+        Result of `accelerometer_array.differences`.
+    readings
+        (n,) m/s^2, in the order of the array.
+    rate_before
+        (3,) rad/s, one interval earlier.
+    interval
+        () s. Infinity removes the angular acceleration: then two opposite rates fit, and `ambiguous`
+        is set.
+    covariance_before
+        (3, 3) covariance of `rate_before`; None if it is exact.
     """
     rate_before = jnp.asarray(rate_before)
     linear = prepared.linear / interval
@@ -97,30 +109,30 @@ def angular_rate(
         cost,
         prepared.degenerate,
         factors.weak,
-        _has_rival(*lax.stop_gradient((problem, rate, cost, rate_before, factors))),
+        _has_second_solution(*lax.stop_gradient((problem, rate, cost, rate_before, factors))),
         converged,
     )
 
 
-def _has_rival(
+def _has_second_solution(
     problem: Quadratic, rate: Array, cost: Array, before: Array, factors: Factors
 ) -> Array:
-    """Whether another rate near enough to be meant fits as well, which only searches can tell.
+    """Whether another rate near enough fits as well, which in general only a search decides.
 
     The residuals at rates a and b differ by exactly ``J((a + b) / 2) @ (a - b)``, J the Jacobian. So
-    where J stays regular, all the way to the opposite rate and several times as far as the rate moved,
-    there is no other, and nothing is searched. It does where, in the coordinates in which J at `rate` is
-    the identity, it changes by less than one.
+    if J stays regular as far as the opposite rate, and several times as far as the rate has changed,
+    there is no other solution and no search. J stays regular if, in the coordinates in which J at
+    `rate` is the identity, it changes by less than one.
     """
     moved = jnp.sqrt(jnp.sum((rate - before) ** 2))
     reach = jnp.maximum(jnp.sqrt(jnp.sum(rate * rate)), 0.5 * (1.0 + _AS_FAR) * moved)
     curved = problem.curved.reshape(-1, 9)
-    seen = multiply(factors.basis.T, curved).reshape(3, 3, 3)
-    change = multiply(factors.inverse.T, seen.swapaxes(0, 1).reshape(3, 9))
+    projected = multiply(factors.basis.T, curved).reshape(3, 3, 3)
+    change = multiply(factors.inverse.T, projected.swapaxes(0, 1).reshape(3, 9))
     regular = ~factors.weak & (2.0 * reach * jnp.sqrt(jnp.sum(change**2)) < 1.0)
 
     def search() -> Array:
-        across = rate + _across(problem, rate, factors, reach)
+        across = rate + _step_across(problem, rate, factors, reach)
         others, found = jax.vmap(lambda x: descend(problem, x))(jnp.stack([-rate, across]))
         costs = jax.vmap(lambda other: jnp.sum(problem.residual(other) ** 2))(others)
         apart = jnp.max(jnp.abs(others - rate[None]), axis=1)
@@ -133,10 +145,10 @@ def _has_rival(
     return lax.cond(regular, lambda: jnp.asarray(False), search)
 
 
-def _across(problem: Quadratic, rate: Array, factors: Factors, reach: Array) -> Array:
-    """From `rate` to where, along the least determined direction, the residuals are the same again (3,).
+def _step_across(problem: Quadratic, rate: Array, factors: Factors, reach: Array) -> Array:
+    """Step (3,) from `rate` along the least determined direction to where the residuals are the same again.
 
-    Zero where that is out of `reach`.
+    It is zero if that is out of `reach`.
     """
     spread = factors.large @ factors.large.T
     for _ in range(3):
@@ -160,17 +172,36 @@ def track(
     start_covariance: Array | None = None,
     forget_s: Array | float | None = None,
 ) -> RateEstimate:
-    """Angular velocity at every sample of `readings` (N, n), m/s^2, each from the one before.
+    """Angular rate at every sample, each from the previous one.
 
-    `noise` as in `placement.differences`. `start_rate` (3,), rad/s, is the one an `interval` before the
-    first sample; `interval`, s, is one number () or one for each sample (N,). With `start_covariance`
-    (3, 3) the covariances are those of the whole way; without it, of each step.
+    With `forget_s` the previous rate decays to zero with that time constant, so that errors do not
+    accumulate: white noise of the angular acceleration of density ``d``, rad/s^2/sqrt(Hz), gives the
+    rate a standard deviation of ``d sqrt(forget_s / 2)`` instead of ``d sqrt(time)``; `covariance` is
+    of that noise alone. The slower part of the rate is lost; `restored` adds it again. Persistent
+    rates and errors above about ``1 / forget_s`` still make the recursion diverge.
 
-    With `forget_s`, (), s, the rate before is led back to zero with that time constant, so that error
-    does not add up for ever: white noise of the angular acceleration of density ``d``, rad/s^2/sqrt(Hz),
-    leaves ``d sqrt(forget_s / 2)`` in place of ``d sqrt(time)``; `covariance` is of that noise alone. The
-    part of the rate that is slower is missing; `restored` adds it again. Rates and errors of more than
-    some ``1 / forget_s`` that last make the recursion run away all the same.
+    Parameters
+    ----------
+    array
+        The array.
+    noise
+        As in `accelerometer_array.differences`.
+    readings
+        (N, n) m/s^2.
+    start_rate
+        (3,) rad/s, one interval before the first sample.
+    interval
+        s, () or one for each sample (N,).
+    start_covariance
+        (3, 3) covariance of `start_rate`; with it, covariances accumulate, without it they are of
+        each step.
+    forget_s
+        Time constant, s, ().
+
+    Raises
+    ------
+    ValueError
+        If the number of columns is not that of the axes.
     """
     readings, start_rate = jnp.asarray(readings), jnp.asarray(start_rate)
     n = jnp.shape(array.axes)[0]
@@ -200,12 +231,18 @@ def track(
 def restored(
     rate: Array, start_rate: Array, interval: Array | float, forget_s: Array | float
 ) -> Array:
-    """Rates (N, 3), rad/s, of `track` with what it forgot added again; the other arguments as there.
+    """Rates (N, 3), rad/s, of `track` with the forgotten part added again.
 
-    They are the sums of the angular accelerations that the readings told, so that slow motion is whole
-    and noise is a random walk again. But the walk does not go back into the recursion: only the
-    centripetal part of each sample uses the rate that was led back. This is what suits a filter
-    that estimates a bias which walks.
+    They are the sums of the measured angular accelerations, so slow motion is complete and noise is a
+    random walk. The random walk does not enter the recursion: only the centripetal part of each
+    sample uses the decayed rate. This suits a filter that estimates a random-walk bias.
+
+    Parameters
+    ----------
+    rate
+        (N, 3) rad/s, of `track`.
+    start_rate, interval, forget_s
+        As in `track`.
     """
     rate = jnp.asarray(rate)
     intervals = jnp.broadcast_to(jnp.asarray(interval, rate.dtype), rate.shape[:1])

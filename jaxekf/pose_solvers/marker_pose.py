@@ -1,11 +1,18 @@
-"""Pose of a rigid tool from single markers, and gravity from poses and an accelerometer, on the host."""
+"""Pose of a rigid tool from single markers, and gravity from poses and an accelerometer, on the host.
+
+`absolute_orientation` solves single frames, `fit_markers` checks them against the tool's geometry,
+`from_markers` returns them as a tracker's stream; `first_consistent_pose` and `gravity` prepare the start
+of a filter.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
+from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.truth import encoder_at
 from jaxekf.recordings.types import (
     NANOSECONDS,
@@ -21,71 +28,79 @@ from jaxekf.recordings.types import (
 )
 
 START_FIT = 4.0
-"""A run does not start from a frame whose markers fit the tool this much worse than the median."""
+"""Factor over the median error: a run does not start from a frame with a larger one."""
 _LARGEST_MISFIT = 0.25
-"""Markers that lie off the tool by more than this share of its size are not those of the tool."""
+"""Share of the tool's size: a larger error means markers of another tool."""
 _START_S = 1.0
 _START_TURN = 6.0
 _LEAST_TURN = 1e-3
 _LARGEST_SPEED = 3.0
 _LEAST_MARKERS = 3
 _LEAST_SPREAD = 0.05
-"""Markers are on a line where they are this much flatter than long."""
+"""Ratio of width to length below which markers are collinear."""
 _LONGEST_STEP_S = 0.2
 _LEAST_GRAVITY_S = 0.5
 
 
-class Fit(NamedTuple):
-    """Rigid fits of many frames."""
+class MarkerPose(NamedTuple):
+    """Rigid-body poses of many frames."""
 
     q_ref_body: Floats
-    """(N, 4)."""
+    """(N, 4) unit quaternions, body to reference."""
     position: Floats
-    """(N, 3) metres: the body's origin in the reference frame."""
+    """(N, 3) metres, the body's origin in the reference frame."""
     error: Floats
-    """(N,) metres: root mean square distance of the markers from the fitted ones."""
+    """(N,) metres, root mean square distance of the markers from their fitted places."""
     valid: Flags
-    """(N,) False where fewer than three markers are seen, or all on a line; the rest is then the
+    """(N,) False if fewer than three markers are visible or all are collinear; the pose is then the
     identity."""
 
 
-def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> Fit:
-    """The pose that takes markers from the body to where they are seen, least squares by SVD.
+def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags) -> MarkerPose:
+    """Least-squares poses from markers (Arun, Huang, Blostein 1987; Kabsch 1976; never a reflection).
 
-    `p_body_marker` (M, 3), `position` (N, M, 3) in the reference frame, `usable` (N, M); metres
-    (Arun, Huang, Blostein 1987; Kabsch 1976, so that it is never a reflection).
+    Parameters
+    ----------
+    p_body_marker
+        (M, 3) metres, body frame.
+    position
+        (N, M, 3) metres, reference frame.
+    usable
+        (N, M) visible markers.
     """
     usable = usable & np.isfinite(position).all(axis=2)
     count = usable.sum(axis=1)
     weight = usable / np.maximum(count, 1)[:, None]
-    seen = np.where(usable[..., None], position, 0.0)
-    body = np.broadcast_to(p_body_marker, seen.shape)
+    measured = np.where(usable[..., None], position, 0.0)
+    body = np.broadcast_to(p_body_marker, measured.shape)
     centre_body = np.einsum("nm,nmi->ni", weight, body)
-    centre_ref = np.einsum("nm,nmi->ni", weight, seen)
+    centre_ref = np.einsum("nm,nmi->ni", weight, measured)
     from_body = body - centre_body[:, None]
-    from_ref = seen - centre_ref[:, None]
+    from_ref = measured - centre_ref[:, None]
     spread = np.linalg.svd(
         np.where(usable[..., None], from_body, 0.0), compute_uv=False, full_matrices=False
     )
     valid = (count >= _LEAST_MARKERS) & (spread[:, 1] > _LEAST_SPREAD * spread[:, 0])
     cross = np.einsum("nm,nmi,nmj->nij", weight, from_ref, from_body)
     cross[~valid] = np.eye(3)
-    u, _, vt = np.linalg.svd(cross)
-    sign = np.ones((len(cross), 3))
-    sign[:, 2] = np.linalg.det(u) * np.linalg.det(vt)
-    matrix = np.einsum("nij,nj,njk->nik", u, sign, vt)
+    matrix = nearest_rotation(cross)
     origin = centre_ref - np.einsum("nij,nj->ni", matrix, centre_body)
     off = from_ref - np.einsum("nij,nmj->nmi", matrix, from_body)
     error = np.sqrt(np.einsum("nm,nmi->n", weight, off**2))
     origin[~valid], error[~valid] = 0.0, 0.0
-    return Fit(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
+    return MarkerPose(from_scipy(Rotation.from_matrix(matrix)), origin, error, valid)
 
 
-def fit_markers(markers: Markers, place: object) -> Fit:
-    """The rigid fit of every frame; raises `RecordingError` where the markers are not those of the tool.
+def fit_markers(markers: Markers, place: object) -> MarkerPose:
+    """The pose of every frame, checked against the tool's geometry.
 
-    Whatever noise there is, it is small beside the tool: a larger misfit is a wrong unit, wrong names,
+    Marker noise is small relative to the tool: a larger error means a wrong unit, wrong marker names,
     or the geometry of another tool.
+
+    Raises
+    ------
+    RecordingError
+        If the median error is above a quarter of the tool's size.
     """
     fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
     if not fit.valid.any():
@@ -95,17 +110,22 @@ def fit_markers(markers: Markers, place: object) -> Fit:
     if off > _LARGEST_MISFIT * size:
         raise RecordingError(
             str(place),
-            f"markers that lie {off:.3g} m off a tool of {size:.3g} m, whatever its pose",
+            f"markers that are {off:.3g} m off a tool of {size:.3g} m in the best pose",
             f"at most {_LARGEST_MISFIT * size:.2g} m",
             "metres in markers.csv and in its geometry, and each marker under its own name",
         )
     return fit
 
 
-def from_markers(markers: Markers, fit: Fit | None = None) -> Optical:
-    """The raw pose a tracker would report for its markers, frame by frame, without any filter.
+def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
+    """The pose that a tracker would report for its markers, frame by frame, without a filter.
 
-    `fit` is that of `fit_markers`, where it is known already.
+    Parameters
+    ----------
+    markers
+        Single markers.
+    fit
+        Result of `fit_markers`, if it is known.
     """
     if fit is None:
         fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
@@ -119,7 +139,10 @@ def from_markers(markers: Markers, fit: Fit | None = None) -> Optical:
 
 
 def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Floats:
-    """Velocity (3,), m/s, at the valid sample `first`, from the next one; 0 where that is too late."""
+    """Velocity (3,), m/s, at the valid sample `first`, by the difference to the next valid one.
+
+    It is zero if the next one is more than 0.2 s later.
+    """
     after = np.flatnonzero(valid[first + 1 :])
     if after.size == 0:
         return np.zeros(3)
@@ -130,42 +153,47 @@ def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Flo
     return (position[second] - position[first]) / step
 
 
-def first_steady(optical: Optical, imu: Imu) -> int | None:
-    """The valid pose to start from: the first of those of the first second that turns to the next as the
-    gyroscope did, and does not jump; where none does, the first of all. None where no pose is valid.
+def first_consistent_pose(optical: Optical, imu: Imu) -> int | None:
+    """Index of the first valid pose that agrees with the gyroscope and does not jump.
 
-    A tracker that has just found its tool may begin with a wrong pose, which no later one corrects for as
-    long as gates refuse what does not fit.
+    The search covers the first second; if no pose agrees, the first valid one is returned, and None
+    without any. A tracker that has just found its tool may begin with a wrong pose, which persists
+    for as long as gates refuse the samples that contradict it.
     """
-    seen = np.flatnonzero(optical.valid)
-    if seen.size == 0:
+    rows = np.flatnonzero(optical.valid)
+    if rows.size == 0:
         return None
-    times = optical.time_ns[seen] - optical.latency_ns
+    times = optical.time_ns[rows] - optical.latency_ns
     span = np.diff(times) / NANOSECONDS
     known = (imu.time_ns - times[0]) / NANOSECONDS
     middle = (times[:-1] - times[0]) / NANOSECONDS + 0.5 * span
     rate = np.stack([np.interp(middle, known, imu.gyroscope[:, i]) for i in range(3)], axis=1)
-    turn = to_scipy(optical.q_ref_body[seen])
-    said = Rotation.from_rotvec(rate * span[:, None])
-    off = (said.inv() * turn[:-1].inv() * turn[1:]).magnitude()
+    turn = to_scipy(optical.q_ref_body[rows])
+    measured = Rotation.from_rotvec(rate * span[:, None])
+    off = (measured.inv() * turn[:-1].inv() * turn[1:]).magnitude()
     near = span <= _LONGEST_STEP_S
     if not near.any():
-        return int(seen[0])
+        return int(rows[0])
     good = near & (off <= max(_LEAST_TURN, _START_TURN * float(np.median(off[near]))))
     if optical.position is not None:
-        good &= np.linalg.norm(np.diff(optical.position[seen], axis=0), axis=1) <= (
+        good &= np.linalg.norm(np.diff(optical.position[rows], axis=0), axis=1) <= (
             _LARGEST_SPEED * span
         )
     good &= times[:-1] - times[0] <= _START_S * NANOSECONDS
-    return int(seen[np.argmax(good)]) if good.any() else int(seen[0])
+    return int(rows[np.argmax(good)]) if good.any() else int(rows[0])
 
 
 def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
-    """Free fall (3,), m/s^2, in the reference frame: what the accelerometer measures besides motion.
+    """Gravity vector (3,), m/s^2, in the reference frame, from poses and specific forces.
 
-    Over every stretch with poses the mean of the accelerometer's readings, turned into the reference
-    frame, is the mean acceleration (the change of velocity) less gravity. The accelerometer's bias goes
-    into the answer as far as the tool did not turn. Raises `RecordingError` where poses are too few.
+    Over every stretch with poses the mean specific force, rotated into the reference frame, is the
+    mean acceleration (the change of velocity) minus gravity. The accelerometer's bias enters the
+    result as far as the tool did not rotate.
+
+    Raises
+    ------
+    RecordingError
+        If accelerometer or positions are missing, or if no stretch of half a second has poses.
     """
     if imu.accelerometer is None or optical.position is None:
         raise RecordingError(str(place), "no accelerometer", "one", "a run with ax, ay, az")
@@ -195,13 +223,13 @@ def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
             str(place),
             f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from",
             "one, or gravity_ref = [x, y, z] in recording.toml",
-            "stating free fall in the reference frame of the poses",
+            "stating the gravity vector in the reference frame of the poses",
         )
     return total / lasted
 
 
 def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[float, float]]:
-    """Velocities of straight lines fitted to both ends of a stretch, and the times they hold at."""
+    """Velocities of lines fitted to both ends of a stretch, and the times at which they are valid."""
     width = min(0.1, 0.4 * (t[-1] - t[0]))
     head, tail = t <= t[0] + width, t >= t[-1] - width
 
@@ -213,3 +241,6 @@ def _end_velocities(t: Floats, position: Floats) -> tuple[Floats, Floats, tuple[
     start, early = slope(head)
     stop, late = slope(tail)
     return start, stop, (early, late)
+
+
+__getattr__ = renamed(__name__, "Fit>MarkerPose first_steady>first_consistent_pose")

@@ -1,61 +1,70 @@
-"""Which way is up in the body, when it rests, and how the magnetic field lies to it, before any filter.
+"""Vertical, static intervals and magnetic field of an IMU, before any filter.
 
-From the samples up to an instant, but for what rest looks like and what the gyroscope reads then, which the
-whole run tells. What is found here says how far a magnetometer is to be trusted; no estimate takes an
-attitude from it.
+The functions use samples up to each instant, except for the noise and bias at rest, which come from the
+whole run. The results weight a magnetometer; no estimate takes its attitude from them.
 """
 
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, period_ns
+from jaxekf._support.deprecations import renamed
+from jaxekf.geometry.host_rotation import running_product
+from jaxekf.recordings.types import (
+    NANOSECONDS,
+    Flags,
+    Floats,
+    Imu,
+    from_scipy,
+    period_ns,
+    to_scipy,
+)
 
 _SETTLING_S = 3.0
-"""Time constant of the low-pass in the frame that does not turn; accelerations of a hand average out."""
+"""Time constant, s, of the low-pass in the non-rotating frame, which averages out accelerations of a
+hand."""
 _STILL_S = 1.0
 _STILL_RATE, _STILL_FORCE = np.deg2rad(1.0), 0.3
-"""rad/s and m/s^2: more than any sensor scatters at rest."""
+"""Bounds on the noise of a static sensor, rad/s and m/s^2."""
 _QUIETEST, _LOUDER = 0.02, 1.6
-"""Share of the seconds that rest at least, and by how much a scatter at rest may exceed theirs."""
+"""Share of seconds that are static at least, and the factor over their scatter that is still static."""
 _LEAST = 0.05
-"""Share of what any sensor scatters that always is rest: readings may repeat to the last bit."""
+"""Share of those bounds below which samples are always static: readings may repeat exactly."""
 _SLOWEST_MEAN = np.deg2rad(2.0)
-"""rad/s: a gyroscope that reads more on average turns, whatever its scatter."""
+"""rad/s: a gyroscope with a larger mean rotates, whatever its scatter."""
 
 
-def turned(imu: Imu) -> Floats:
-    """Quaternions (N, 4) that take the body at each sample to the body at the first, by gyroscope alone."""
+def integrated_attitude(imu: Imu) -> Floats:
+    """Quaternions (N, 4) from the body at each sample to the body at the first, by the gyroscope alone."""
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
-    half = 0.5 * np.linalg.norm(angle, axis=1)
-    q = np.zeros((len(imu.time_ns), 4))
-    q[0, 0] = 1.0
-    q[1:, 0] = np.cos(half)
-    q[1:, 1:] = 0.5 * angle * np.sinc(half / np.pi)[:, None]
-    # The product of all before each, in a number of passes that grows with the logarithm only.
-    reach = 1
-    while reach < len(q):
-        q[reach:] = _product(q[:-reach], q[reach:])
-        reach *= 2
+    q = running_product(from_scipy(Rotation.from_rotvec(angle)))
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
 def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
-    """Unit vectors (N, 3): the specific force, low-passed in a frame that does not turn, in the body.
+    """Unit vectors (N, 3) of the vertical in the body frame.
 
-    The low-pass is of second order (Butterworth) and takes `settling_s` seconds. What the gyroscope reads
-    at rest is taken off, where the run rests: what is led on by a bias lags behind by degrees.
+    The specific force is low-passed in a non-rotating frame. The gyroscope's bias at rest is subtracted if
+    the run has static intervals; otherwise the frame would drift and the result lag by degrees.
+
+    Parameters
+    ----------
+    imu
+        Samples with specific forces.
+    settling_s
+        Time constant of the second-order Butterworth low-pass, s.
     """
     # Slow to import, and every model is imported with this module.
     from scipy.signal import butter, sosfilt, sosfilt_zi
 
     assert imu.accelerometer is not None
-    resting = still(imu)
+    resting = static_samples(imu)
     bias = np.median(imu.gyroscope[resting], axis=0) if resting.any() else np.zeros(3)
-    q = turned(replace(imu, gyroscope=imu.gyroscope - bias))
-    force = _rotate(q, imu.accelerometer)
+    q = to_scipy(integrated_attitude(replace(imu, gyroscope=imu.gyroscope - bias)))
+    force = q.apply(imu.accelerometer)
     if len(force) == 1:
         return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
     rate = NANOSECONDS / max(period_ns(imu.time_ns), 1)
@@ -63,15 +72,15 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
     sos = butter(2, corner, fs=rate, output="sos")
     first = force[: max(1, int(0.1 * rate))].mean(axis=0)
     smooth, _ = sosfilt(sos, force, axis=0, zi=sosfilt_zi(sos)[:, :, None] * first)
-    inside = _rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), smooth)
+    inside = q.inv().apply(smooth)
     return inside / np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
 
 
-def still(imu: Imu) -> Flags:
-    """(N,) whether the IMU has rested for the last second: readings scatter as little as they ever do.
+def static_samples(imu: Imu) -> Flags:
+    """Mask (N,) of samples at the end of a static second.
 
-    What they scatter at rest is found from the quietest seconds of the run, within what any sensor's noise
-    is.
+    A second is static if its readings scatter as little as in the quietest seconds of the run, whose
+    scatter is limited to a sensor's possible noise.
     """
     width = max(2, int(_STILL_S * NANOSECONDS / max(period_ns(imu.time_ns), 1)))
     quiet = _quiet(imu.gyroscope, width, _STILL_RATE)
@@ -82,8 +91,8 @@ def still(imu: Imu) -> Flags:
     return quiet
 
 
-class Field(NamedTuple):
-    """The magnetic field as it is felt."""
+class MagneticField(NamedTuple):
+    """Magnetic field as measured."""
 
     norm: Floats
     """(N,) in the sensor's unit."""
@@ -91,19 +100,19 @@ class Field(NamedTuple):
     """(N,) rad below the horizontal."""
 
 
-def field(imu: Imu) -> Field:
-    """Norm and dip at each sample of a magnetometer; NaN where it was not read."""
+def magnetic_field(imu: Imu) -> MagneticField:
+    """Norm and dip of the field at each sample of a magnetometer; NaN where it was not read."""
     assert imu.magnetometer is not None
     norm = np.linalg.norm(imu.magnetometer, axis=1)
-    # Some write zeros for what they did not read.
+    # Some loggers write zeros for missing readings.
     norm = np.where(np.isfinite(norm) & (norm > 0.0), norm, np.nan)
     with np.errstate(invalid="ignore"):
         down = -np.sum(imu.magnetometer * up_in_body(imu), axis=1) / norm
-    return Field(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
+    return MagneticField(norm, np.arcsin(np.clip(down, -1.0, 1.0)))
 
 
 def _quiet(values: Floats, width: int, most: float) -> Flags:
-    """Whether the last `width` of values (N, 3) scatter hardly more than the quietest, and below `most`."""
+    """Whether the last `width` of values (N, 3) scatter about as the quietest, and less than `most`."""
     values = values - values.mean(axis=0)
     spread = _trailing(values**2, width) - _trailing(values, width) ** 2
     deviation = np.sqrt(np.maximum(spread.max(axis=1), 0.0))
@@ -112,19 +121,14 @@ def _quiet(values: Floats, width: int, most: float) -> Flags:
 
 
 def _trailing(values: Floats, width: int) -> Floats:
-    """Mean of the last `width` values, fewer at the start."""
+    """Mean of the last `width` values, of fewer at the start."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - width, 0)
     return (total[end] - total[begin]) / (end - begin)[:, None]
 
 
-def _product(p: Floats, q: Floats) -> Floats:
-    w = p[:, 0] * q[:, 0] - np.sum(p[:, 1:] * q[:, 1:], axis=1)
-    v = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
-    return np.concatenate([w[:, None], v], axis=1)
-
-
-def _rotate(q: Floats, vectors: Floats) -> Floats:
-    swing = 2.0 * np.cross(q[:, 1:], vectors)
-    return vectors + q[:, :1] * swing + np.cross(q[:, 1:], swing)
+__getattr__ = renamed(
+    __name__,
+    "Field>MagneticField field>magnetic_field still>static_samples turned>integrated_attitude",
+)

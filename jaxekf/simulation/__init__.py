@@ -1,6 +1,8 @@
-"""Simulated runs with their truth, and the demo runs that come with the package.
+"""Simulated runs with ground truth, and the demo runs that come with the package.
 
-All modules are public. A new rig is a file here that returns a `Recording` and knows the truth.
+`attitude_runs` simulates a tracked attitude with an IMU, `marker_runs` a tool with single markers,
+`camera_runs` landmarks in images, `gyro_free_runs` an accelerometer array. All modules are public. A new
+rig is a file here that returns a `Recording` with its ground truth.
 """
 
 from jaxekf._support.lazy import attributes

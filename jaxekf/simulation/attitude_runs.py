@@ -1,6 +1,6 @@
-"""Runs with known truth: the paper's experiment, free smooth rotations, and draws from any model.
+"""Simulated attitude runs: a robot joint at constant rate, smooth free rotation, and samples of any model.
 
-Every source of randomness is named by an explicit seed or key.
+Every source of randomness has an explicit seed or key.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.constants import GRAVITY_REF
 from jaxekf.filtering.ekf import inputs_of
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.filtering.steps import Steps
@@ -32,14 +33,14 @@ from jaxekf.recordings.types import (
 
 @dataclass(frozen=True)
 class SensorGrade:
-    """How good the simulated sensors are."""
+    """Noise and rates of the simulated sensors."""
 
     gyroscope_deg: float = 0.05
     """White noise of the rate, deg/s/sqrt(Hz)."""
     bias_walk_deg: float = 0.005
     """Random walk of the bias, deg/s^2/sqrt(Hz)."""
     bias_deg: float = 0.5
-    """Standard deviation of the bias at the start, deg/s."""
+    """Standard deviation of the initial bias, deg/s."""
     optical_deg: float = 0.3
     """Tracker attitude noise per axis, deg."""
     position_mm: float = 0.2
@@ -48,26 +49,25 @@ class SensorGrade:
     imu_hz: float = 125.0
     encoder_hz: float = 125.0
     accelerometer: float | None = None
-    """White noise of the specific force, m/s^2/sqrt(Hz); None for an IMU without."""
+    """White noise of the specific force, m/s^2/sqrt(Hz); None for an IMU without accelerometer."""
     magnetometer: float | None = None
-    """Noise of the field per axis, share of its norm; None for an IMU without."""
+    """Noise of the field per axis, share of its norm; None for an IMU without magnetometer."""
 
 
-GRAVITY_REF = (0.0, 0.0, -9.80665)
 FIELD_REF = (0.0, 0.5, -0.5 * np.sqrt(3.0))
-"""The magnetic field that a simulated IMU feels: north along y, 60 deg below the horizontal."""
+"""Simulated magnetic field: north along y, 60 deg below the horizontal."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A smooth attitude over time: roll, pitch and yaw, each a rate and some sinusoids.
+    """A smooth attitude over time: roll, pitch and yaw, each a constant rate and sinusoids.
 
     ``q(t) = exp(a_z(t) e_z) exp(a_y(t) e_y) exp(a_x(t) e_x)`` with
-    ``a(t) = rate * ramp(t) + sum(amplitude * sin(2 pi f t + phase))``, less its value at 0.
+    ``a(t) = rate * ramp(t) + sum(amplitude * sin(2 pi f t + phase))``, minus its value at 0.
     """
 
     rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Constant rate of each turn, rad/s, from `rest_s` on."""
+    """Constant rate of each angle, rad/s, from `rest_s` on."""
     amplitude: Floats | None = None
     """(3, m) radians."""
     frequency: Floats | None = None
@@ -75,10 +75,10 @@ class Motion:
     phase: Floats | None = None
     """(3, m) radians."""
     rest_s: float = 0.0
-    """The body rests this long at the start."""
+    """Duration of rest at the start, s."""
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """The three turns (N, 3) and their rates, at times t in seconds."""
+        """The three angles (N, 3), rad, and their rates, rad/s, at times t (N,) in seconds."""
         moving = np.maximum(t - self.rest_s, 0.0)[:, None]
         on = (t >= self.rest_s)[:, None]
         angle, speed = moving * np.array(self.rate), np.where(on, np.array(self.rate), 0.0)
@@ -103,14 +103,14 @@ class Motion:
 
 
 def constant_rate_motion(rate_deg: float = -9.0, rest_s: float = 10.0) -> Motion:
-    """The paper's experiment: a robot joint turns about x at a constant rate after a rest."""
+    """The paper's experiment: a robot joint rotates about x at constant rate after a rest."""
     return Motion(rate=(np.deg2rad(rate_deg), 0.0, 0.0), rest_s=rest_s)
 
 
 def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> Motion:
     """A smooth random rotation about all axes, of about `speed_deg` deg/s rms in roll and yaw.
 
-    Pitch stays within 70 deg, so that roll and yaw stay meaningful in a picture.
+    Pitch stays within 70 deg, so that roll and yaw remain meaningful in a plot.
     """
     rng = np.random.default_rng([seed, 1])
     frequency = rng.uniform(0.15, 0.9, (3, 4))
@@ -123,7 +123,7 @@ def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> M
 
 
 def sample_times(hertz: float, duration_s: float, start_ns: int) -> Times:
-    """Regular sampling instants over the run."""
+    """Regular sampling times, ns."""
     count = int(np.floor(duration_s * hertz + 1e-9)) + 1
     return start_ns + np.round(np.arange(count) / hertz * NANOSECONDS).astype(np.int64)
 
@@ -140,11 +140,28 @@ def recording(
     start_ns: int = 0,
     marker_body: tuple[float, float, float] = (0.15, 0.0, 0.10),
 ) -> Recording:
-    """Record a motion with a tracker, a gyroscope and an encoder.
+    """Record a motion with a tracker, an IMU and an encoder.
 
-    `occlusions` are (start, end) in seconds in which the tracker sees nothing; each of its other
-    samples is lost with probability `dropouts`. The tracker's position is that of a marker at
-    `marker_body` metres on a tool that turns about the origin.
+    Parameters
+    ----------
+    name
+        Name of the run.
+    motion
+        The motion.
+    seed
+        Seed of all sensor noise.
+    duration_s
+        Length, s.
+    grade
+        Noise and rates of the sensors.
+    occlusions
+        (start, end) in seconds without tracker samples.
+    dropouts
+        Probability that any other tracker sample is lost.
+    start_ns
+        Time of the first samples, ns.
+    marker_body
+        (3,) m, body frame: the point whose position the tracker reports; the tool rotates about the origin.
     """
     grade = grade or SensorGrade()
     rng = np.random.default_rng([seed, 0])
@@ -186,9 +203,9 @@ def _optical(
     t = seconds(times)
     q, _ = motion.attitude(t)
     noise = np.deg2rad(grade.optical_deg) * rng.standard_normal((len(t), 3))
-    measured = Rotation.from_quat(np.roll(q, -1, axis=1)) * Rotation.from_rotvec(noise)
+    measured = to_scipy(q) * Rotation.from_rotvec(noise)
     blur = 1e-3 * grade.position_mm * rng.standard_normal((len(t), 3))
-    position = Rotation.from_quat(np.roll(q, -1, axis=1)).apply(marker_body) + blur
+    position = to_scipy(q).apply(marker_body) + blur
     visible = rng.uniform(size=len(t)) >= dropouts
     for begin, end in occlusions:
         visible &= (t < begin) | (t >= end)
@@ -210,20 +227,20 @@ def _imu(
 
 
 def _earth(motion: Motion, grade: SensorGrade, seed: int, imu: Imu) -> Imu:
-    """The IMU with what it feels of gravity and field; it stands where the tool turns about."""
+    """The IMU with readings of gravity and field; it is at the tool's centre of rotation."""
     rng = np.random.default_rng([seed, 1])
     q, _ = motion.attitude(seconds(imu.time_ns))
     into_body = to_scipy(q).inv()
 
-    def felt(vector: Sequence[float], deviation: float) -> Floats:
+    def measured(vector: Sequence[float], deviation: float) -> Floats:
         return into_body.apply(vector) + deviation * rng.standard_normal((len(q), 3))
 
     force = field = None
     if grade.accelerometer is not None:
         up = [-g for g in GRAVITY_REF]
-        force = felt(up, grade.accelerometer * np.sqrt(grade.imu_hz))
+        force = measured(up, grade.accelerometer * np.sqrt(grade.imu_hz))
     if grade.magnetometer is not None:
-        field = felt(FIELD_REF, grade.magnetometer)
+        field = measured(FIELD_REF, grade.magnetometer)
     return Imu(imu.time_ns, imu.gyroscope, force, field)
 
 
@@ -237,11 +254,26 @@ def _encoder(motion: Motion, grade: SensorGrade, duration_s: float, start_ns: in
 def draw(
     model: Model, params: Parameters, start: Any, steps: Steps, key: Array
 ) -> tuple[Any, Steps]:
-    """Draw truth and measurements from a model itself, for tests of consistency.
+    """Draw ground truth and measurements from a model, for tests of consistency.
 
-    From the true state `start` the transition is sampled with its process noise and every visible row
-    with its sensor's noise. Returns the states at the end of each substep, leading axes (K, S), and
-    `steps` with the sampled values in place. Works under `vmap`.
+    Works under `vmap`.
+
+    Parameters
+    ----------
+    model
+        The model.
+    params
+        Its parameters.
+    start
+        True initial state.
+    steps
+        Timeline whose values are replaced.
+    key
+        Random key.
+
+    Returns
+    -------
+    The states at the end of each substep, leading axes (K, S), and `steps` with simulated values.
     """
     steps = jax.tree.map(jnp.asarray, steps)
     inputs = inputs_of(model, params, steps)
@@ -266,9 +298,9 @@ def draw(
     def epoch(x: Any, given: Any) -> Any:
         dt, u, fast, slow, key = given
         keys = jax.random.split(key, dt.shape[0] + 1)
-        x, (states, seen) = lax.scan(substep, x, (dt, u, fast, keys[:-1]))
+        x, (states, measured) = lax.scan(substep, x, (dt, u, fast, keys[:-1]))
         last = None if u is None else jax.tree.map(lambda a: a[-1], u)
-        return x, (states, seen, measure(x, last, slow, keys[-1]))
+        return x, (states, measured, measure(x, last, slow, keys[-1]))
 
     keys = jax.random.split(key, steps.dt.shape[0])
     given = (steps.dt, inputs, steps.fast, steps.slow, keys)
@@ -280,7 +312,7 @@ def draw(
 
 
 def _correlated(key: Array, cov: Array) -> Array:
-    """A normal draw of a covariance that may be singular (zero in a step of no length)."""
+    """A normal sample with a covariance that may be singular (zero in a step of zero length)."""
     values, vectors = jnp.linalg.eigh(cov)
     draw = jax.random.normal(key, cov.shape[:1], cov.dtype)
     return vectors @ (jnp.sqrt(jnp.maximum(values, 0.0)) * draw)

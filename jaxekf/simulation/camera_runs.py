@@ -1,15 +1,14 @@
-"""Recorded runs of a camera and an IMU that draw an eight before a scene of two textured planes.
+"""Simulated runs of a camera and an IMU that follow a figure eight in front of two textured planes.
 
-The experiment of Hol (2008): an eight of 2.6 m in 5.4 s, drawn again and again, at up to 4 m/s^2 and
-1 rad/s; a camera of 320 by 240 pixels behind a lens of 3.2 mm, at 12.5 Hz; landmarks on a wall and a floor.
-The scene's x points up.
+The experiment of Hol (2008): an eight of 2.6 m in 5.4 s, at up to 4 m/s^2 and 1 rad/s; a camera of 320 by
+240 pixels with a lens of 3.2 mm, at 12.5 Hz; landmarks on a wall and a floor. The scene's x points up.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxekf.geometry.pinhole import NEAREST
+from jaxekf.geometry import pinhole
 from jaxekf.recordings.types import (
     Camera,
     Encoder,
@@ -29,13 +28,13 @@ IMAGE = (320, 240)
 FOCAL = 213.3
 """Pixels: 3.2 mm at 15 um a pixel."""
 _TOWARDS_SCENE = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-"""Body to scene of a body that looks at the wall: its z along the scene's, its x to the right (the scene's
+"""Body to scene of a body that faces the wall: its z along the scene's, its x to the right (the scene's
 y), its y down (against the scene's x)."""
 
 
 @dataclass(frozen=True)
 class CameraGrade:
-    """How good camera and IMU are."""
+    """Noise and rates of camera and IMU."""
 
     imu: ToolGrade = field(
         default_factory=lambda: ToolGrade(
@@ -50,18 +49,18 @@ class CameraGrade:
     )
     camera_hz: float = 12.5
     points: int = 30
-    """Landmarks that are found in an image at most."""
+    """Largest number of landmarks detected in an image."""
     pixel: float = 0.7
-    """Standard deviation of an image point in each direction, pixels."""
+    """Standard deviation of an image point per axis, pixels."""
     mismatched: float = 0.0
-    """Share of points that are those of another landmark in the image."""
+    """Share of points that belong to another landmark in the image."""
     blurred: float = np.inf
-    """rad/s: in images taken while the body turns faster nothing is found."""
+    """rad/s: in images taken at faster rotation nothing is detected."""
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where the camera is in the body, and its lens."""
+    """Pose of the camera in the body, and its lens."""
 
     p_body_camera: Floats = field(default_factory=lambda: np.array([0.03, -0.02, 0.05]))
     q_body_camera: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
@@ -70,16 +69,16 @@ class Mount:
 
 @dataclass(frozen=True)
 class Facing(Motion):
-    """A motion about the attitude in which the body looks at the wall."""
+    """A motion relative to the attitude in which the body faces the wall."""
 
     def attitude(self, t: Floats) -> tuple[Floats, Floats]:
-        """As of `Motion`."""
+        """As in `Motion`."""
         q, rate = super().attitude(t)
         return from_scipy(to_scipy(_TOWARDS_SCENE) * to_scipy(q)), rate
 
 
 def eight(seed: int = 0) -> ToolMotion:
-    """The eight, 2.6 m wide and 1.1 m high, before the wall; `seed` varies how the body sways."""
+    """The eight, 2.6 m wide and 1.1 m high, in front of the wall; `seed` varies the sway of the body."""
     rng = np.random.default_rng([seed, 31])
     once = 1.0 / PERIOD_S
     # x up, y along the wall, z to it: sums of a constant (a sinusoid of frequency 0) and sinusoids.
@@ -95,8 +94,10 @@ def eight(seed: int = 0) -> ToolMotion:
 
 
 def shaken(seed: int = 0) -> ToolMotion:
-    """A hand that turns and shakes the camera before the wall, by up to 20 deg and some 2 rad/s: what tells
-    where the camera is in the body."""
+    """A hand that rotates and shakes the camera in front of the wall, by up to 20 deg and some 2 rad/s.
+
+    This motion determines the camera's pose in the body.
+    """
     rng = np.random.default_rng([seed, 34])
     size = (3, 2)
     sway = Facing(
@@ -115,7 +116,7 @@ def shaken(seed: int = 0) -> ToolMotion:
 
 
 def resting() -> ToolMotion:
-    """A body that rests at the middle of the eight and looks at the wall."""
+    """A static body at the middle of the eight, facing the wall."""
     nothing = np.zeros((3, 1))
     place, up = np.array([[1.4], [0.0], [-2.6]]), np.full((3, 1), np.pi / 2)
     still = Facing(amplitude=nothing, frequency=nothing, phase=nothing)
@@ -123,7 +124,7 @@ def resting() -> ToolMotion:
 
 
 def scene(seed: int = 0, count: int = 160) -> Floats:
-    """Landmarks (count, 3), metres: half of them on the wall (z = 0), half on the floor (x = 0)."""
+    """Landmarks (count, 3), m: half of them on the wall (z = 0), half on the floor (x = 0)."""
     rng = np.random.default_rng([seed, 32])
     wall = count // 2
     points = np.zeros((count, 3))
@@ -144,10 +145,28 @@ def camera_recording(
     blind: tuple[tuple[float, float], ...] = (),
     start_ns: int = 0,
 ) -> Recording:
-    """Record a motion (the eight unless given) as landmarks in images, with an IMU and the true pose.
+    """Record a motion as landmarks in images, with an IMU and the true pose at the IMU's times.
 
-    `blind` are times, from and to, seconds, without images in which anything is found. The encoder holds
-    the truth at the IMU's instants.
+    Parameters
+    ----------
+    name
+        Name of the run.
+    motion
+        The motion, by default the eight.
+    seed
+        Seed of all noise.
+    duration_s
+        Length, s.
+    grade
+        Noise and rates of the sensors.
+    mount
+        The camera's pose in the body, and its lens.
+    landmarks
+        (L, 3) m, by default `scene`.
+    blind
+        (start, end) in seconds without detections.
+    start_ns
+        Time of the first samples, ns.
     """
     return camera_run(
         name,
@@ -174,7 +193,7 @@ def camera_run(
     blind: tuple[tuple[float, float], ...] = (),
     start_ns: int = 0,
 ) -> tuple[Recording, Unrecorded]:
-    """As `camera_recording`, with what else is true."""
+    """The same as `camera_recording`, with the ground truth that a recording does not hold."""
     grade, mount = grade or CameraGrade(), mount or Mount()
     motion = eight(seed) if motion is None else motion
     landmarks = scene() if landmarks is None else landmarks
@@ -201,7 +220,7 @@ def _camera(
     blind: tuple[tuple[float, float], ...],
     rng: np.random.Generator,
 ) -> Camera:
-    """What is found in each image: of the landmarks inside it so many at random."""
+    """Detections in each image: a random choice of the visible landmarks."""
     t = seconds(taken_ns)
     q, rate = motion.attitude.attitude(t)
     body = to_scipy(q)
@@ -231,13 +250,12 @@ def _camera(
 
 
 def _image(inside: Floats, mount: Mount) -> tuple[Floats, Flags]:
-    """Image points (N, L, 2) of landmarks (N, L, 3) in the camera's frame, and which lie in the image."""
-    ahead = inside[..., 2] > 10.0 * NEAREST
+    """Image points (N, L, 2) of landmarks (N, L, 3) in the camera frame, and those within the image."""
+    ahead = inside[..., 2] > 10.0 * pinhole.NEAREST
     point = inside[..., :2] / np.where(ahead, inside[..., 2], 1.0)[..., None]
     r2 = np.sum(point * point, axis=-1)
     # Beyond the corners the distortion would fold points back into the image.
     ahead &= r2 < 1.1 * np.sum((np.array(IMAGE) / (2.0 * FOCAL)) ** 2) / 0.9**2
-    stretch = 1.0 + (mount.radial[0] + mount.radial[1] * r2) * r2
-    pixel = FOCAL * point * stretch[..., None] + np.array(IMAGE) / 2.0
+    pixel = FOCAL * point * pinhole.stretch(mount.radial, point)[..., None] + np.array(IMAGE) / 2.0
     inside_image = ((pixel >= 0.0) & (pixel < np.array(IMAGE))).all(axis=-1)
     return pixel, ahead & inside_image

@@ -1,7 +1,7 @@
-"""The recordings that come with the package, made by its own simulator.
+"""The demo recordings that come with the package, made by its own simulator.
 
-Seven runs with different motions: the paper's constant rate, and free rotations from slow to fast,
-each with a rest at the start and some occlusions.
+Seven runs with different motions: the paper's constant rate, and free rotations from slow to fast, each
+with a rest at the start and some occlusions. `paths` returns their folders.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ def paths(names: tuple[str, ...]) -> list[Path]:
 
 
 def make() -> list[Recording]:
-    """The bundled runs, simulated anew; the same bits every time but for rounding in the CSV files."""
+    """The bundled runs, simulated anew; reproducible but for rounding in the CSV files."""
     runs = [
         attitude_runs.recording(
             "constant-rate",
@@ -64,7 +64,7 @@ def make() -> list[Recording]:
 
 
 def write(folder: Path = FOLDER) -> None:
-    """Write the bundled runs, small: seven digits."""
+    """Write the bundled runs with seven digits."""
     for run in make():
         run_folder.save(run, folder / run.name, overwrite=True, digits=7)
 

@@ -1,9 +1,9 @@
-"""A handheld instrument in microsurgery, felt by an array of accelerometers and a magnetometer.
+"""A simulated handheld instrument for microsurgery with an accelerometer array and a magnetometer.
 
-The system of Ang, Khosla and Riviere: three dual-axis accelerometers and no gyroscope, whose
-differences tell the rate (`jaxekf.pose_solvers.gyro_free_rate`), 500 times a second. The hand trembles
-at 8 to 12 Hz and moves on purpose below 1 Hz; both are sums of sinusoids, so that every derivative is
-exact. The world is theirs: x to magnetic north, y west, z up.
+The system of Ang, Khosla and Riviere: three dual-axis accelerometers without a gyroscope, whose differences
+give the rate (`jaxekf.pose_solvers.gyro_free_rate`), at 500 Hz. The hand's tremor is at 8 to 12 Hz, its
+voluntary motion below 1 Hz; both are sums of sinusoids, so every derivative is exact. The reference frame
+is theirs: x to magnetic north, y west, z up.
 """
 
 from collections.abc import Iterator
@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support import compilation
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.pose_solvers import accelerometer_array
 from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray
 from jaxekf.pose_solvers.gyro_free_rate import restored, track
@@ -25,41 +26,40 @@ from jaxekf.simulation.marker_runs import GRAVITY_REF, ToolMotion
 TREMOR_HZ = (8.0, 12.0)
 VOLUNTARY_HZ = (0.05, 0.9)
 TREMOR_UM = 50.0
-"""Root mean square of the tremor's translation, micrometres: of the vector's length."""
+"""Root mean square length of the tremor's translation, micrometres."""
 TREMOR_LEVER_M = 0.1
-"""The tremor turns by its translation at this distance: root mean square 0.5 mrad."""
+"""The tremor's rotation is its translation over this lever: root mean square 0.5 mrad."""
 VOLUNTARY_MM = 1.0
-"""Root mean square of the voluntary translation, the vector's length."""
+"""Root mean square length of the voluntary translation, mm."""
 VOLUNTARY_DEG = 2.0
-"""Root mean square of the voluntary rotation, over all three turns."""
+"""Root mean square of the voluntary rotation, all three angles together, deg."""
 FORGET_S = 2.0
-"""Time constant for `differential.track` that suits this hand and the default array: of half hours,
-none in three runs away with up to 4 s, two do with 5 s."""
+"""Time constant, s, of `gyro_free_rate.track` for this hand and the default array: of three half-hour runs
+none diverges with up to 4 s, two do with 5 s."""
 _TONES = 12
 """Sinusoids in each band of each degree of freedom."""
 _BLOCK = 20_000
-"""Samples that are worked on at once: each has some hundred sinusoids."""
-_G = 9.80665
+"""Samples that are simulated at once, each with some hundred sinusoids."""
 
 
 @dataclass(frozen=True)
 class SurgeryGrade:
-    """How good the sensors are; the defaults are an ADXL-203 and an HMC-2003."""
+    """Noise and rate of the sensors; the defaults are an ADXL-203 and an HMC-2003."""
 
     accelerometer_ug: float = 110.0
     """White noise of each accelerometer, micro-g/sqrt(Hz)."""
     magnetometer_ugauss: float = 40.0
-    """Standard deviation of a sample of the field, microgauss: what the HMC-2003 is said to resolve."""
+    """Standard deviation of a field sample, microgauss: the HMC-2003's stated resolution."""
     field_gauss: float = 0.53
-    """Strength of the Earth's field: that of Pittsburgh."""
+    """Strength of the Earth's field in Pittsburgh, gauss."""
     dip_deg: float = 67.0
-    """How far the field dips below the horizontal there."""
+    """Dip of the field below the horizontal there, deg."""
     hertz: float = 500.0
 
     @property
     def acceleration_density(self) -> float:
         """White noise of each accelerometer, m/s^2/sqrt(Hz)."""
-        return 1e-6 * _G * self.accelerometer_ug
+        return 1e-6 * STANDARD_GRAVITY * self.accelerometer_ug
 
     @property
     def acceleration_sigma(self) -> float:
@@ -74,11 +74,11 @@ class SurgeryGrade:
 
 
 class ArrayRun(NamedTuple):
-    """What an array and a magnetometer read, and what is true at the same instants."""
+    """Readings of an array and a magnetometer, with the ground truth at the same times."""
 
     time_ns: Times
     readings: Floats
-    """Of each accelerometer axis (N, n), m/s^2."""
+    """(N, n) m/s^2, one column for each accelerometer axis."""
     field: Floats
     """(N, 3) gauss, body frame."""
     truth: Encoder
@@ -90,7 +90,7 @@ class ArrayRun(NamedTuple):
 def handheld_array(half_edge_m: float = 0.025) -> AccelerometerArray:
     """The paper's three dual-axis chips, on three corners of a cube about the body's origin.
 
-    No two of the corners share an edge. Then the middle of the two chips that feel an axis lies on that
+    No two corners share an edge. The midpoint of the two chips with the same sensitive axis is then on that
     axis, and the mean of their readings is free of angular acceleration; see `mean_force`.
     """
     corners = half_edge_m * jnp.array([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]])
@@ -98,9 +98,9 @@ def handheld_array(half_edge_m: float = 0.025) -> AccelerometerArray:
 
 
 def surgical_motion(seed: int, *, body_acceleration: bool = True) -> ToolMotion:
-    """A random hand motion at a microscope: tremor and what is done on purpose, in all six degrees.
+    """A random hand motion at a microscope: tremor and voluntary motion in all six degrees of freedom.
 
-    Without `body_acceleration` the body's origin rests and only turns.
+    Without `body_acceleration` the body's origin is at rest and the body only rotates.
     """
     rng = np.random.default_rng([seed, 11])
     tremor_m, voluntary_m = 1e-6 * TREMOR_UM, 1e-3 * VOLUNTARY_MM
@@ -113,9 +113,9 @@ def surgical_motion(seed: int, *, body_acceleration: bool = True) -> ToolMotion:
 def _tones(
     rng: np.random.Generator, tremor: float, voluntary: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Amplitude, frequency and phase (3, m) of sinusoids whose vector has these root mean squares.
+    """Amplitude, frequency and phase (3, m) of sinusoids with these root mean squares of the vector.
 
-    One frequency is drawn from each equal part of a band: two that nearly agree would beat for minutes.
+    One frequency is drawn from each equal part of a band: two similar ones would beat for minutes.
     """
     part = (np.arange(_TONES) + rng.uniform(size=(2, 3, _TONES))) / _TONES
     bands = np.array([TREMOR_HZ, VOLUNTARY_HZ])[:, :, None, None]
@@ -132,10 +132,10 @@ def _joined(bands: Floats) -> Floats:
 
 
 def angular_acceleration(motion: Motion, t: Floats) -> Floats:
-    """Of a body that does not rest at first, (N, 3), rad/s^2, body frame, at times t in seconds.
+    """Angular acceleration (N, 3), rad/s^2, body frame, of a motion without rest at times t (N,), s.
 
-    The derivative of ``rate = e_x a_x' + v a_y' + u a_z'``, in which v and u are the axes of the turns
-    about y and z as the body sees them: ``v = R_x' e_y`` and ``u = R_x' R_y' e_z``.
+    The derivative of ``rate = e_x a_x' + v a_y' + u a_z'``, with v and u the axes of the rotations about y
+    and z in the body frame: ``v = R_x' e_y`` and ``u = R_x' R_y' e_z``.
     """
     angle, speed = motion.angles(t)
     (x, y, _), (dx, dy, dz) = angle.T, speed.T
@@ -161,7 +161,7 @@ def angular_acceleration(motion: Motion, t: Floats) -> Floats:
 
 
 def specific_forces(motion: ToolMotion, array: AccelerometerArray, t: Floats) -> Floats:
-    """What each axis of an array feels (N, n), m/s^2, by the rigid-body law, at times t in seconds."""
+    """Specific force along each axis of an array (N, n), m/s^2, at times t (N,), s."""
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - GRAVITY_REF)
     acceleration = angular_acceleration(motion.attitude, t)
@@ -181,9 +181,24 @@ def array_run(
     grade: SurgeryGrade | None = None,
     start_ns: int = 0,
 ) -> ArrayRun:
-    """Samples of every accelerometer axis and of the field, with white noise, over `duration_s`.
+    """Samples of every accelerometer axis and of the field, with white noise.
 
-    Half an hour at 500 Hz takes some 200 MB: it is made in blocks.
+    Half an hour at 500 Hz takes some 200 MB and is simulated in blocks.
+
+    Parameters
+    ----------
+    motion
+        The motion.
+    array
+        The accelerometer array.
+    seed
+        Seed of the noise.
+    duration_s
+        Length, s.
+    grade
+        Noise and rate of the sensors.
+    start_ns
+        Time of the first sample, ns.
     """
     grade = grade or SurgeryGrade()
     rng = np.random.default_rng([seed, 12])
@@ -209,12 +224,12 @@ def _blocks(t: Floats) -> Iterator[tuple[slice, Floats]]:
 
 
 def mean_force(array: AccelerometerArray, readings: Floats) -> Floats:
-    """Specific force (N, 3), m/s^2, that explains the readings (N, n) best by itself.
+    """Specific force (N, 3), m/s^2, that alone explains the readings (N, n) best.
 
-    A dual-axis chip does not feel all of it, so that it takes the whole array: of the paper's, each
-    component is the mean of the two axes along it. Its noise is independent of that of the rate, which
-    comes from what this leaves over. The rest of the rigid-body law stays in; of `handheld_array`,
-    at its origin, that is the centripetal part, some mm/s^2 at a rate of 0.3 rad/s.
+    A dual-axis chip measures two components only, so the whole array is needed: for the paper's, each
+    component is the mean of two axes. Its noise is independent of that of the rate, which uses the
+    residuals. The remaining rigid-body terms stay in; for `handheld_array`, at its origin, these are
+    the centripetal terms, some mm/s^2 at a rate of 0.3 rad/s.
     """
     return readings @ np.linalg.pinv(np.asarray(array.axes)).T
 
@@ -234,22 +249,21 @@ def array_rate(
     grade: SurgeryGrade,
     forget_s: float = FORGET_S,
 ) -> Floats:
-    """Angular rate (N, 3), rad/s, of an array's readings (N, n), from an unknown first one.
+    """Angular rate (N, 3), rad/s, from an array's readings (N, n), with an unknown initial rate.
 
-    By `jaxekf.pose_solvers.gyro_free_rate.track`, which forgets over `forget_s`, and `restored`: what
-    is wrong is the first rate, and a random walk (`rate_walk`). It is early by half an interval, as the
-    backward difference of eq. 3 takes the angular acceleration at a sample for that of the interval
-    before.
+    It uses `jaxekf.pose_solvers.gyro_free_rate.track` with `forget_s`, and `restored`: the errors are the
+    initial rate and a random walk (`rate_walk`). The rate is early by half an interval, as the backward
+    difference of eq. 3 takes the angular acceleration at a sample for that of the previous interval.
     """
     sigma, interval = grade.acceleration_sigma, 1.0 / grade.hertz
     return np.asarray(_rates(array, sigma, readings, interval, forget_s))
 
 
 def rate_walk(array: AccelerometerArray, grade: SurgeryGrade) -> Floats:
-    """Random walk of the rate an array tells, lower-triangular factor (3, 3), rad/s^2/sqrt(Hz).
+    """Random walk of an array's rate, lower-triangular factor (3, 3), rad/s^2/sqrt(Hz).
 
-    Each step adds ``T^2 inv(M) Xi inv(M)'`` to the covariance of the rate, ``Xi`` that of the differences
-    and M their linear part: per second T times that with ``Xi`` of a sample, or, as it stands here,
+    Each step adds ``T^2 inv(M) Xi inv(M)'`` to the covariance of the rate, ``Xi`` that of the
+    differences and M their linear part: per second T times that with ``Xi`` of a sample, or, as here,
     ``inv(M) Xi inv(M)'`` with ``Xi`` of a density.
     """
     linear = np.asarray(
@@ -266,8 +280,11 @@ def array_recording(
     grade: SurgeryGrade | None = None,
     forget_s: float = FORGET_S,
 ) -> Recording:
-    """A run as one of an IMU: the array's rate (`array_rate`) in place of a gyroscope's, its mean force
-    (`mean_force`), the field in gauss, and the truth as encoder."""
+    """A run as that of an IMU.
+
+    The gyroscope is the array's rate (`array_rate`), the accelerometer its mean force (`mean_force`), the
+    magnetometer the field in gauss, and the encoder the ground truth.
+    """
     grade = grade or SurgeryGrade()
     rate = array_rate(array, run.readings, grade, forget_s)
     imu = Imu(run.time_ns, rate, mean_force(array, run.readings), run.field)

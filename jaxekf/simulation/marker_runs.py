@@ -1,4 +1,4 @@
-"""Recorded runs of a tool that moves in six degrees of freedom, seen as single markers, with an IMU."""
+"""Simulated runs of a tool that moves in six degrees of freedom, tracked by single markers, with an IMU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxekf.models import inertial, tight
+from jaxekf._support import constants
+from jaxekf.models import tight
 from jaxekf.recordings.types import Encoder, Floats, Imu, Markers, Recording, Times, to_scipy
 from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
 
-GRAVITY_REF = np.array(inertial.STANDARD_GRAVITY)
-_G = 9.80665
+GRAVITY_REF = np.array(constants.GRAVITY_REF)
 
 
 @dataclass(frozen=True)
 class ToolGrade:
-    """How good IMU and tracker are; the defaults are an ADIS16350 and the tracker of Tobergte (2009)."""
+    """Noise and rates of IMU and tracker; the defaults are an ADIS16350 and Tobergte's tracker (2009)."""
 
     gyroscope_deg: float = 0.05
     """White noise of the rate, deg/s/sqrt(Hz)."""
@@ -27,15 +27,15 @@ class ToolGrade:
     accelerometer_walk: float = 1e-3
     """Random walk of the accelerometer's bias, m/s^3/sqrt(Hz)."""
     bias_deg: float = 0.5
-    """Standard deviation of the gyroscope's bias at the start, deg/s."""
+    """Standard deviation of the gyroscope's initial bias, deg/s."""
     accelerometer_bias: float = 0.1
-    """Standard deviation of the accelerometer's bias at the start, m/s^2."""
+    """Standard deviation of the accelerometer's initial bias, m/s^2."""
     marker_mm: float = 0.231
     """Noise of a marker's position per axis, mm."""
     imu_s: float = 0.002
     tracker_s: float = 0.018
     latency_s: float = 0.034
-    """How long after it was taken a tracker's frame arrives, and is stamped."""
+    """Delay, s, between a tracker frame and its arrival, at which it is stamped."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def free_tool_motion(seed: int) -> ToolMotion:
 
 @dataclass(frozen=True)
 class Tool:
-    """Where the markers sit in the IMU's frame."""
+    """Marker positions in the IMU's frame."""
 
     names: tuple[str, ...] = ("1", "2", "3")
     p_body_marker: Floats = field(default_factory=tight.L_SHAPE.copy)
@@ -110,11 +110,11 @@ class Tool:
 
 
 Hidden = Sequence[tuple[str, float, float]]
-"""Marker, and from when to when in seconds it is hidden."""
+"""Marker, and the times in seconds from and to which it is hidden."""
 
 
 def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: float = 0.25) -> Hidden:
-    """From `begin_s` on only one marker is seen at a time, each for `each_s` in turn."""
+    """Occlusions that leave one marker visible at a time, each for `each_s` in turn, from `begin_s` on."""
     hidden = []
     count = int(np.ceil((duration_s - begin_s) / each_s))
     for i in range(count):
@@ -125,14 +125,14 @@ def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: floa
 
 
 class Unrecorded(NamedTuple):
-    """What is true at the IMU's instants and in no recording; each (N, 3)."""
+    """Ground truth at the IMU's times that no recording holds; each (N, 3)."""
 
     velocity: Floats
     """m/s, reference frame."""
     bias: Floats
-    """Of the gyroscope, rad/s."""
+    """Gyroscope bias, rad/s, body frame."""
     accelerometer_bias: Floats
-    """m/s^2."""
+    """m/s^2, body frame."""
 
 
 def tool_recording(
@@ -146,10 +146,27 @@ def tool_recording(
     hidden: Hidden = (),
     start_ns: int = 0,
 ) -> Recording:
-    """Record a motion as single markers, stamped on arrival, with an IMU and the true pose.
+    """Record a motion as single markers, with an IMU and the true pose at the IMU's times.
 
-    The encoder holds the truth at the IMU's instants. All times start at `start_ns`: the first frame is
-    taken there and arrives later by the latency.
+    Parameters
+    ----------
+    name
+        Name of the run.
+    motion
+        The motion.
+    seed
+        Seed of all noise.
+    duration_s
+        Length, s.
+    grade
+        Noise and rates of the sensors.
+    tool
+        Marker positions.
+    hidden
+        Occlusions of single markers.
+    start_ns
+        Time of the first samples, ns; the first frame is taken then, and arrives and is stamped later by
+        the latency.
     """
     return tool_run(
         name,
@@ -174,7 +191,7 @@ def tool_run(
     hidden: Hidden = (),
     start_ns: int = 0,
 ) -> tuple[Recording, Unrecorded]:
-    """As `tool_recording`, with what else is true."""
+    """The same as `tool_recording`, with the ground truth that a recording does not hold."""
     grade, tool = grade or ToolGrade(), tool or Tool()
     rng = np.random.default_rng([seed, 6])
     taken = sample_times(1.0 / grade.tracker_s, duration_s, start_ns)
@@ -197,19 +214,19 @@ def tool_markers(
     grade: ToolGrade,
     hidden: Hidden,
 ) -> Markers:
-    """What the tracker makes of the tool; hidden markers are NaN."""
+    """The tracker's measurement of the tool; hidden markers are NaN."""
     t = seconds(taken_ns)
     q, _ = motion.attitude.attitude(t)
-    turned = np.stack([to_scipy(q).apply(place) for place in tool.p_body_marker], axis=1)
-    exact = motion.position(t)[:, None] + turned
-    seen = exact + 1e-3 * grade.marker_mm * rng.standard_normal(exact.shape)
-    visible = np.ones(seen.shape[:2], bool)
+    arms = np.stack([to_scipy(q).apply(place) for place in tool.p_body_marker], axis=1)
+    exact = motion.position(t)[:, None] + arms
+    measured = exact + 1e-3 * grade.marker_mm * rng.standard_normal(exact.shape)
+    visible = np.ones(measured.shape[:2], bool)
     for name, begin, end in hidden:
         visible[(t >= begin) & (t < end), tool.names.index(name)] = False
-    seen[~visible] = np.nan
+    measured[~visible] = np.nan
     latency = round(grade.latency_s * 1e9)
     return Markers(
-        taken_ns + latency, seen, visible, tool.names, tool.p_body_marker, latency_ns=latency
+        taken_ns + latency, measured, visible, tool.names, tool.p_body_marker, latency_ns=latency
     )
 
 
@@ -220,7 +237,7 @@ def tool_imu(
     grade: ToolGrade,
     gravity_ref: Floats = GRAVITY_REF,
 ) -> tuple[Imu, Floats, Floats]:
-    """Gyroscope and accelerometer with white noise, and the biases, which walk, of each."""
+    """Gyroscope and accelerometer with white noise and random-walk biases, and these biases."""
     t = seconds(time_ns)
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - gravity_ref)
@@ -236,7 +253,7 @@ def tool_imu(
         force,
         rng,
         grade.imu_s,
-        1e-3 * _G * grade.accelerometer_mg,
+        1e-3 * constants.STANDARD_GRAVITY * grade.accelerometer_mg,
         grade.accelerometer_walk,
         grade.accelerometer_bias,
     )
@@ -246,7 +263,7 @@ def tool_imu(
 def _biased(
     exact: Floats, rng: np.random.Generator, dt: float, white: float, walk: float, start: float
 ) -> tuple[Floats, Floats]:
-    """Samples with white noise and a bias that starts at random and walks, and that bias."""
+    """Samples with white noise and a bias that starts at random and is a random walk, and that bias."""
     first = start * rng.standard_normal(3)
     steps = walk * np.sqrt(dt) * rng.standard_normal(exact.shape)
     noise = white / np.sqrt(dt) * rng.standard_normal(exact.shape)

@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 import jaxekf
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.cli import main
 from jaxekf.simulation import attitude_runs
@@ -562,7 +563,7 @@ def test_an_export_is_described_not_rewritten(folder):
     rows = ["Logger 7", "calibrated", "Frame;Acc X;Acc Y;Acc Z;Rot Z;Rot Y;Rot X;Stamp"]
     imu, optical = before.need_imu(), before.need_optical()
     for i, (t, w, a) in enumerate(zip(imu.time_ns, imu.gyroscope, imu.accelerometer, strict=True)):
-        numbers = [*(a / 9.80665), *np.rad2deg(w[::-1])]
+        numbers = [*(a / STANDARD_GRAVITY), *np.rad2deg(w[::-1])]
         rows.append(";".join([str(i), *(f"{v:.12g}" for v in numbers), f"{t / 1e6:.6f}"]))
     write(folder / "export.csv", rows)
     rows = []

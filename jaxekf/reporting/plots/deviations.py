@@ -76,7 +76,7 @@ def _slopes(axes: Any, sensor: SensorNoise, turn: float) -> None:
     tau = np.array(axes.get_xlim())
     white = turn * float(np.mean(sensor.white))
     axes.plot(tau, white / np.sqrt(tau), ":", color=TRUTH, lw=1, label="white noise, ∝ 1/√τ")
-    walks = [made.walk.value for made in sensor.axes if made.walk.found]
+    walks = [made.walk.value for made in sensor.axes if made.walk.significant]
     if walks:
         walk = turn * float(np.mean(walks))
         axes.plot(

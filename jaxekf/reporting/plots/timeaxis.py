@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jaxekf.checks.inspection import Inspection, StreamFound
+from jaxekf.checks.inspection import Inspection, StreamSummary
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Recording, Times
 from jaxekf.reporting.plots.style import ESTIMATE, REFUSED, new_figure, styled
 
@@ -68,7 +68,7 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
 
 def _lanes(
     recording: Recording, found: Inspection
-) -> dict[str, tuple[StreamFound, Times, dict[str, Flags]]]:
+) -> dict[str, tuple[StreamSummary, Times, dict[str, Flags]]]:
     """What was found, times and masked samples by reason, for each lane."""
     lanes = {}
     for label, stream in recording.streams.items():
@@ -103,7 +103,9 @@ def _masked(recording: Recording, label: str, stream: Any) -> dict[str, Flags]:
     return found
 
 
-def _density(axes: Any, line: int, t: Floats, told: StreamFound, masked: dict[str, Flags]) -> None:
+def _density(
+    axes: Any, line: int, t: Floats, told: StreamSummary, masked: dict[str, Flags]
+) -> None:
     """Usable samples in each part of the lane's time, as a share of what the nominal rate would give."""
     good = np.ones(len(t), bool)
     for flags in masked.values():
@@ -138,7 +140,7 @@ def _stretches(t: Floats, chosen: Flags) -> list[tuple[float, float]]:
     return [(float(t[a]), float(t[b])) for a, b in zip(edges[::2], ends, strict=True)]
 
 
-def _words(told: StreamFound) -> str:
+def _words(told: StreamSummary) -> str:
     lines = [f"{told.rate_hz:.4g} Hz" if told.rate_hz == told.rate_hz else "1 sample"]
     if told.gaps.count:
         lines.append(f"{told.gaps.count} gaps, {told.gaps.lost_s:.3g} s")

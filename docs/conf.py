@@ -1,0 +1,69 @@
+"""How the manual is built: python -m sphinx -W --keep-going -b html docs docs/_build"""
+
+import os
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent / "examples")]
+
+# Examples wait for the compiler, not for what it makes.
+os.environ.setdefault("JAXEKF_COMPILE", "quick")
+# XLA logs lines of three kilobytes for programs read from a cache.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jaxekf  # noqa: E402
+
+jaxekf.set_up()
+
+project = "jaxekf"
+author = "The jaxekf authors"
+copyright = "The jaxekf authors, MIT licence"
+release = version = jaxekf.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "gallery", "auto_gallery/*.ipynb", "auto_gallery/*.py"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
+myst_heading_anchors = 3
+# Docstrings write code in single backquotes.
+default_role = "code"
+
+html_theme = "furo"
+html_title = f"jaxekf {release}"
+html_static_path: list[str] = []
+html_show_sphinx = False
+
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+python_maximum_signature_line_length = 80
+copybutton_prompt_text = r">>> |\.\.\. "
+copybutton_prompt_is_regexp = True
+
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "auto_gallery",
+    "filename_pattern": r"/plot_",
+    "image_scrapers": ("_figures",),
+    "reset_modules": (),
+    "download_all_examples": False,
+    "show_memory": False,
+    "show_signature": False,
+    "remove_config_comments": True,
+    "capture_repr": (),
+    "abort_on_example_error": True,
+    "min_reported_time": 0,
+    "parallel": False,
+}
+suppress_warnings = ["config.cache"]

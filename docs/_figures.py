@@ -9,8 +9,6 @@ from typing import Any
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst
 
-from jaxekf.reporting import plots
-
 
 class FigureScraper:
     """Saves every figure that a block left in a variable, once."""
@@ -28,7 +26,8 @@ class FigureScraper:
             if name.startswith("_") or not isinstance(figure, Figure) or known:
                 continue
             self.seen.append(figure)
-            files.append(str(plots.save(figure, next(block_vars["image_path_iterator"]))))
+            files.append(str(next(block_vars["image_path_iterator"])))
+            figure.savefig(files[-1], dpi=130)
         return figure_rst(files, conf["src_dir"])
 
 

@@ -12,6 +12,8 @@ os.environ.setdefault("JAXEKF_COMPILE", "quick")
 # XLA logs lines of three kilobytes for programs read from a cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+from sphinx.ext.napoleon.docstring import NumpyDocstring  # noqa: E402
+
 import jaxekf  # noqa: E402
 
 jaxekf.set_up()
@@ -67,3 +69,11 @@ sphinx_gallery_conf = {
     "parallel": False,
 }
 suppress_warnings = ["config.cache"]
+
+
+# Napoleon takes what goes before a colon in the description of an attribute for its type; here it is text.
+def _as_written(docstring: NumpyDocstring) -> list[str]:
+    return docstring._consume_to_end()
+
+
+NumpyDocstring._parse_attribute_docstring = _as_written  # type: ignore[method-assign]

@@ -74,4 +74,4 @@ bias = plots.figure_functions()["bias"](estimate, run)
 # As a script, with a file's name, it writes the first picture there.
 
 if __name__ == "__main__" and len(sys.argv) == 2:
-    plots.save(errors, sys.argv[1])
+    errors.savefig(sys.argv[1], dpi=110)

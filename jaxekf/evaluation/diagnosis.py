@@ -102,6 +102,17 @@ def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosi
     Errors count at those instants whose nearest encoder sample is scored, as in `jaxekf.score`. Works for
     every model; latency, gyroscope bias and matrix are looked for where a sensor measures an attitude and
     the model puts out `attitude` and `rate`.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> [verdict.kind for verdict in jaxekf.diagnose(jaxekf.estimate(late)).verdicts]
+    ['latency']
     """
     return diagnose_many([estimate], None if recording is None else [recording])
 

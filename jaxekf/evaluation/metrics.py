@@ -105,6 +105,15 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
 
     What the model does not put out, or the encoder does not tell, is NaN. Positions are those of the
     body's origin in the reference frame. Raises `RecordingError` for a run without an encoder.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> found = jaxekf.score(jaxekf.estimate(run), run)
+    >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
+    0.094 deg, NEES 0.99
     """
     truth = encoder_at(recording.need_encoder(), estimate.time_ns)
     judged = truth.scored & (estimate.time >= burn_in_s)

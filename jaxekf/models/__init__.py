@@ -45,6 +45,13 @@ def get_model(model: str | Model) -> Model:
 
     ``module`` is imported as Python would from the current directory. Raises `ModelError` where there
     is no such model.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> model.name, model.error_dim, [sensor.name for sensor in model.sensors]
+    ('loose', 6, ['optical'])
     """
     if isinstance(model, Model):
         return model

@@ -1,6 +1,7 @@
 """How the manual is built: python -m sphinx -W --keep-going -b html docs docs/_build"""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ os.environ.setdefault("JAXEKF_COMPILE", "quick")
 # XLA logs lines of three kilobytes for programs read from a cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+from sphinx.application import Sphinx  # noqa: E402
 from sphinx.ext.napoleon.docstring import NumpyDocstring  # noqa: E402
 
 import jaxekf  # noqa: E402
@@ -56,6 +58,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "gallery",
     "gallery_dirs": "auto_gallery",
     "filename_pattern": r"/plot_",
+    "within_subsection_order": "FileNameSortKey",
     "image_scrapers": ("_figures",),
     "reset_modules": (),
     "download_all_examples": False,
@@ -76,3 +79,12 @@ def _as_written(docstring: NumpyDocstring) -> list[str]:
 
 
 NumpyDocstring._parse_attribute_docstring = _as_written  # type: ignore[method-assign]
+
+
+def _plain_paths(app: Sphinx, context: object, lines: list[str]) -> None:
+    """Defaults that are paths as a user writes them."""
+    lines[:] = [re.sub(r"PosixPath\('(.*?)'\)", r"\1", line) for line in lines]
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("sphinx-click-process-options", _plain_paths)

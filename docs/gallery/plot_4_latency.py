@@ -33,7 +33,7 @@ print(f"{1e3 * fault.size[0]:.1f} ± {1e3 * fault.sigma[0]:.1f} ms")
 # gyroscope:
 
 aligned = alignment.align_run(late)
-print(aligned.tracker)
+print(f"{1e3 * aligned.tracker.latency_s:.1f} ± {1e3 * aligned.tracker.latency_sigma_s:.1f} ms")
 
 # %%
 # With the latency stated in the recording the verdict is gone, and the error is that of the
@@ -46,4 +46,6 @@ for name, made in {"late": estimate, "corrected": corrected}.items():
     print(f"{name}: attitude RMSE {jaxekf.score(made, run).attitude_rmse_deg:.3f} deg")
 
 # %%
+# The errors of the late run: they grow with the rate, and leave the two-sigma band.
+
 attitude = plots.figure_functions()["attitude"](estimate, late)

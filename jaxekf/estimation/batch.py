@@ -63,6 +63,16 @@ def estimate(
     Raises `RecordingError` for what is wrong with the data or where nothing of `at` lies within the run,
     `FilterError` where the recursion broke, `ResourceError` where memory is too small for it,
     `PrecisionError` in float32.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> estimate.attitude.value.shape, estimate.attitude.frame, estimate.attitude.unit
+    ((3001, 4), 'body', 'rad')
+    >>> print(f"NIS {estimate.mean_nis('optical'):.2f}")
+    NIS 0.98
     """
     return estimate_many([run], model, params, smooth=smooth, at=at if at is None else [at])[0]
 
@@ -80,6 +90,14 @@ def estimate_many(
 
     `at` has an entry for each run, or is one grid for all. Raises `ValueError` where it is neither, and
     what `estimate` raises.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimates = jaxekf.estimate_many(jaxekf.demo.paths(("free-4", "free-5")))
+    >>> [made.run for made in estimates]
+    ['free-4', 'free-5']
     """
     require_float64()
     if isinstance(at, Every):

@@ -114,6 +114,17 @@ def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosi
         Estimate of a whole run.
     recording
         The run, if it has an encoder.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> [verdict.kind for verdict in jaxekf.diagnose(jaxekf.estimate(late)).verdicts]
+    ['latency']
     """
     return diagnose_many([estimate], None if recording is None else [recording])
 

@@ -121,6 +121,15 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     ------
     RecordingError
         If the run has no encoder.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> found = jaxekf.score(jaxekf.estimate(run), run)
+    >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
+    0.094 deg, NEES 0.99
     """
     truth = encoder_at(recording.need_encoder(), estimate.time_ns)
     judged = truth.scored & (estimate.time >= burn_in_s)

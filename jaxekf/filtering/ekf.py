@@ -125,6 +125,17 @@ def run_filter(
     first.
 
     Raises `ModelError` for an unknown `keep`, and where forward mode meets the adjoint.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> run = jaxekf.jit(lambda params: jaxekf.run_filter(model, params, belief, line.steps))
+    >>> bool(run(model.parameters).instants.healthy.all())
+    True
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
     options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "refused": one[3]}

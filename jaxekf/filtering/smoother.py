@@ -41,6 +41,19 @@ def run_smoother(
     """Filter and smooth one run from an initial belief; differentiable in everything.
 
     Samples that the filter's gates refused stay refused. Options and errors as in `run_filter`.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> run = jaxekf.jit(lambda params: jaxekf.run_smoother(model, params, belief, line.steps))
+    >>> output = run(model.parameters)
+    >>> smoothed, filtered = output.smoothed.cov, output.filtered.instants.updated.cov
+    >>> bool(smoothed.trace(axis1=-2, axis2=-1).mean() < filtered.trace(axis1=-2, axis2=-1).mean())
+    True
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
     found = run_smoother_batch(model, *one, adjoint=adjoint)

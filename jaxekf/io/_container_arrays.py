@@ -190,7 +190,9 @@ def _follow(path: Path, node: Any, name: str, kind: type, wanted: str, key: str 
         )
     found = node[name]
     if not isinstance(found, kind):
-        raise RecordingError(place, type(found).__name__, wanted, "another layout (see README)")
+        raise RecordingError(
+            place, type(found).__name__, wanted, "another layout (see docs/formats.md)"
+        )
     return found
 
 

@@ -24,7 +24,7 @@ def read_description(folder: Path) -> dict[str, Any]:
         raise RecordingError(folder, "no such folder", "a recorded run's folder", "another path")
     if not file.is_file():
         raise RecordingError(
-            file, "no such file", "the description of the run", "writing one (see README)"
+            file, "no such file", "the description of the run", "writing one (see docs/formats.md)"
         )
     try:
         about = tomllib.loads(file.read_text("utf-8-sig"))

@@ -42,6 +42,13 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
 
     The streams must agree in units, order of quaternions and times
     (`plausible.require`); ``trust_units = true`` in `recording.toml` leaves that out.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> run.name, run.need_optical().q_ref_body.shape, run.need_imu().gyroscope.shape
+    ('free-5', (1501, 4), (3001, 3))
     """
     if container.is_container(path):
         made = container.load(path, sort=sort)
@@ -173,6 +180,17 @@ def save(
     every file is in `recording.toml`, and `load` refuses files that were changed since. Raises
     `RecordingError`
     where the folder may not be written, or the run could not be read again.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = jaxekf.save(run, folder + "/run.h5")
+    ...     again = jaxekf.load(path)
+    >>> bool((again.need_imu().gyroscope == run.need_imu().gyroscope).all())
+    True
     """
     if container.is_container(path):
         return container.save(recording, path, overwrite=overwrite)

@@ -58,6 +58,13 @@ def get_model(model: str | Model) -> Model:
     ------
     ModelError
         If there is no such model.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> model.name, model.error_dim, [sensor.name for sensor in model.sensors]
+    ('loose', 6, ['optical'])
     """
     if isinstance(model, Model):
         return model

@@ -25,6 +25,13 @@ def robust(model: str | Model, means: Means, probability: float = _GATE) -> Mode
 
     The same object for the same arguments. Raises `ModelError` for other means, or a probability that
     is not between 0 and 1.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> model = jaxekf.robust("loose", "huber")
+    >>> [(sensor.name, sensor.weighting) for sensor in model.sensors]
+    [('optical', 'huber')]
     """
     if means not in MEANS or not 0.0 < probability < 1.0:
         raise ModelError(

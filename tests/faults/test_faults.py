@@ -558,7 +558,7 @@ def test_30_status_and_fit_error(folder):
 
 
 def test_an_export_is_described_not_rewritten(folder):
-    """Would catch the README's own page not working: columns, degrees, g, ms, mm, no header."""
+    """Would catch the manual's own example not working: columns, degrees, g, ms, mm, no header."""
     before = plain(folder)
     rows = ["Logger 7", "calibrated", "Frame;Acc X;Acc Y;Acc Z;Rot Z;Rot Y;Rot X;Stamp"]
     imu, optical = before.need_imu(), before.need_optical()
@@ -576,8 +576,8 @@ def test_an_export_is_described_not_rewritten(folder):
         (folder / name).unlink()
     text = (folder / "recording.toml").read_text()
     text = re.sub(r"\[(imu|optical)\]\n(?:(?!\[).*\n)*", "", text)
-    readme = (ROOT / "README.md").read_text("utf-8")
-    told = readme[readme.index("schema_version = 1\n\n[imu]") :].split("```")[0]
+    page = (ROOT / "docs" / "recordings.md").read_text("utf-8")
+    told = page[page.index("schema_version = 1\n\n[imu]") :].split("```")[0]
     (folder / "recording.toml").write_text(f"{text}\n{told.split('schema_version = 1')[1]}")
     run = plain(folder)
     np.testing.assert_array_equal(run.imu.time_ns, imu.time_ns)

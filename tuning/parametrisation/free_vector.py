@@ -32,7 +32,14 @@ _INSIDE = 1.0 - 1e-9
 
 @dataclass(frozen=True)
 class Free:
-    """A free parameter, with its prior and bounds."""
+    """A free parameter, with its prior and bounds.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> tuning.Free("calibration.clock_offset", each_run=True, prior=0.01, bounds=(-0.1, 0.1)).name
+    'calibration.clock_offset'
+    """
 
     name: str
     """A leaf such as ``noise.optical`` or ``calibration.clock_offset``, or a section such as ``noise``."""

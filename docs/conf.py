@@ -16,9 +16,12 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 from sphinx.application import Sphinx  # noqa: E402
 from sphinx.ext.napoleon.docstring import NumpyDocstring  # noqa: E402
 
+import _streams  # noqa: E402
+
 import jaxekf  # noqa: E402
 
 jaxekf.set_up()
+_streams.write(HERE / "_generated" / "streams.md")
 
 project = "jaxekf"
 author = "The jaxekf authors"
@@ -34,7 +37,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_build", "gallery", "auto_gallery/*.ipynb", "auto_gallery/*.py"]
+exclude_patterns = ["_build", "_generated", "gallery", "auto_gallery/*.ipynb", "auto_gallery/*.py"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "attrs_inline"]
 myst_heading_anchors = 3
 # Docstrings write code in single backquotes.

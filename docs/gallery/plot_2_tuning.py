@@ -23,7 +23,7 @@ runs = [
     for seed in range(4)
 ]
 training, unseen = runs[:3], runs[3]
-tuned = tuning.tune(training, objective="likelihood", judge=True, iterations=20)
+tuned = tuning.tune(training, objective="likelihood", confidence_intervals=True, iterations=20)
 for label, (value, low, high) in tuned.intervals.items():
     print(f"{label:18} {value:.3g}, 95 % interval {low:.3g} to {high:.3g}")
 for label, recordings in tuned.open.items():

@@ -506,7 +506,7 @@ def test_a_step_far_astray_does_not_flatten_the_rest():
     assert figure is not None
     low, high = figure.document["layout"]["yaxis"]["range"]
     assert low < -3.0 and -1.0 < high < 10.0
-    assert "1 values lie above" in figure.caption
+    assert "Values above the range shown: 1." in figure.caption
 
 
 def test_before_and_after_in_their_units():

@@ -114,7 +114,7 @@ def search(history: Sequence[Step], best: int, *, again: bool = False) -> Figure
     if any(step.rejected for step in history):
         caption += " Rejected steps have no value: they are drawn at the level of the step before."
     if above:
-        caption += f" {above} values are above the range shown."
+        caption += f" Values above the range shown: {above}."
     return Figure("search", "The search", caption, {"data": data, "layout": layout})
 
 

@@ -124,7 +124,7 @@ def triad_covariance(
 
     The error is a rotation vector in the body frame: ``estimate = truth * exp(error)``. With axes ``t1``
     along the first vector ``a``, ``t2`` along ``a x b`` and ``t3 = t1 x t2``, changes ``da`` and ``db`` of
-    the vectors rotate the axes by
+    the vectors rotate the axes by::
 
         phi = t1 x da/|a| + t1 (t2.db - (b.t1) t2.da/|a|) / |t1 x b|
 

@@ -70,7 +70,7 @@ class Text(NamedTuple):
 
     def cell(self, row: int, column: int) -> str:
         """One cell, without spaces around it."""
-        before = row * self.ends.shape[1] + column - 1
+        before = row * len(self.header) + column - 1
         begin = int(self.ends.flat[before]) + 1 if before >= 0 else 0
         raw = self.data[begin : int(self.ends[row, column])]
         return raw.decode("utf-8", "replace").translate(_SHOWN).strip()
@@ -86,7 +86,7 @@ class Text(NamedTuple):
         sizes = np.diff(self.ends.reshape(-1), prepend=-1).reshape(self.ends.shape)
         kept = np.repeat(chosen, sizes.sum(axis=1))
         data = np.frombuffer(self.data, np.uint8)[kept].tobytes()
-        ends = (np.cumsum(sizes[chosen]) - 1).reshape(-1, sizes.shape[1])
+        ends = (np.cumsum(sizes[chosen]) - 1).reshape(-1, len(self.header))
         return self._replace(data=data, ends=ends, lines=self.lines[chosen])
 
     def with_decimal_points(self) -> bytes:

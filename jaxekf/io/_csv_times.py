@@ -51,7 +51,7 @@ def format_seconds(time_ns: int, decimals: int = 0) -> str:
 def parsed_times(text: Text, column: int, unit_ns: Decimal, parsed: Callable[[int], int]) -> Times:
     """A column (N,) of times in units of `unit_ns` nanoseconds.
 
-    Cells of digits with at most one decimal mark are read together; `parsed` reads any other, given its row.
+    Cells of digits with at most one decimal mark are read together; `parsed` reads the others by row.
     """
     exponent = unit_ns.adjusted()
     decimal = unit_ns == Decimal(1).scaleb(exponent)

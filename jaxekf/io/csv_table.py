@@ -373,6 +373,12 @@ def _no_time(table: Table, row: int) -> RecordingError:
 def read_times(table: Table, *, repeated: bool = False) -> Times:
     """The column ``time`` (N,), which increases; with `repeated`, consecutive rows may share a time."""
     times = stamps(table)
+    check_increasing(table, times, repeated=repeated)
+    return times
+
+
+def check_increasing(table: Table, times: Times, *, repeated: bool = False) -> None:
+    """Raise at the first time (N,) that does not increase; with `repeated`, at the first that decreases."""
     step = np.diff(times)
     backwards = np.flatnonzero(step < 0 if repeated else step <= 0)
     if backwards.size:
@@ -384,7 +390,6 @@ def read_times(table: Table, *, repeated: bool = False) -> Times:
             "times that do not decrease" if repeated else "times that increase",
             "sorting the rows" if repeated else "sorting the rows and removing duplicates",
         )
-    return times
 
 
 def flags(table: Table, name: str) -> NDArray[np.bool_]:

@@ -12,9 +12,10 @@ from jaxekf.recordings.types import NANOSECONDS, Times
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 CHUNK = 1 << 16
-_LONGEST = 19
+_LONGEST = 20
 """Characters of a time that is read without a Python object."""
 _LARGEST_NS = Decimal(2**63 - 1)
+_POWERS = np.array([10**i for i in range(20)], np.uint64)
 
 
 def parse_seconds(text: str, exponent: int = 9) -> int:
@@ -78,7 +79,7 @@ def _plain_times(
     plain = (end > begin) & (end - begin <= _LONGEST)
     cells = gather(text.data, begin, end, min(width, _LONGEST))
     mark = ord("\x1f" if text.decimal_commas else ".")
-    value = np.zeros(len(begin), np.int64)
+    value = np.zeros(len(begin), np.uint64)
     digits, decimals = np.zeros((2, len(begin)), np.int64)
     after = np.zeros(len(begin), bool)
     for column in cells.T:
@@ -90,9 +91,11 @@ def _plain_times(
         decimals += digit & after
         after |= point
     power = exponent - decimals
-    # Digits and zeros together stay below 2**63; a fraction of a nanosecond has to be rounded.
-    plain &= (digits > 0) & (power >= 0) & (digits + power <= 18)
-    return np.where(plain, value * 10 ** np.clip(power, 0, 18), 0), plain
+    # 19 digits fit into 64 bits without a sign; a fraction of a nanosecond has to be rounded.
+    plain &= (digits > 0) & (power >= 0) & (digits + power <= 19)
+    value = np.where(plain, value * _POWERS[np.clip(power, 0, 19)], np.uint64(0))
+    plain &= value < 2**63
+    return np.where(plain, value, np.uint64(0)).astype(np.int64), plain
 
 
 def gather(

@@ -150,7 +150,7 @@ def _renamed(text: Text, columns: Mapping[str, str]) -> tuple[str, ...]:
         raise RecordingError(
             text.path,
             f"columns {','.join(text.header)}",
-            f"among them {','.join(missing)}, as recording.toml says",
+            f"among them {','.join(missing)}, as recording.toml states",
             "correcting the names under columns in recording.toml",
             line=text.header_line,
         )

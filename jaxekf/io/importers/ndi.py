@@ -265,7 +265,7 @@ def _stamped(
         label = header.cells[group.time]
         first = next((c for row in range(len(table)) if (c := table.cell(row, label))), "")
         if ":" in first:
-            sentence = "Times are the export's dates and times of day, taken for UTC"
+            sentence = "Times are the export's dates and times of day, assumed to be UTC"
             return stamped_rows(table, *_dates(table, label)), sentence
         unit = unit_of(label) or "s"
         if unit not in _TICKS:

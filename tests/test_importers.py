@@ -163,6 +163,24 @@ def test_ndi_a_line_for_each_tool(write):
     assert any("UTC" in text for text in recording.info["assumptions"])
 
 
+@pytest.mark.parametrize(("mark", "other"), [(".", ","), (",", ".")])
+def test_commas_in_names_are_no_decimal_marks(write, mark, other):
+    """Would catch a name that is cut at its comma, points in names that make decimal commas doubtful, a mixture
+    of marks that is guessed at, and blank cells with spaces that are no numbers."""
+    head = "Frame;Time [s];Tool;Q0;Qx;Qy;Qz;Tx;Ty;Tz"
+    row = "{i};1700000000{m}{i}23456789;Probe, v1.rom;0{m}8;0;0;0{m}6;{i}{m}5;0;0"
+    lines = [head, *(row.format(i=i, m=mark) for i in range(1, 4))]
+    blank = [*lines[:3], lines[3].replace(";0;0;0", "; ; ;0")]
+    recording = ndi.load(write(blank), tool="Probe, v1.rom")
+    optical = recording.need_optical()
+    assert optical.time_ns[1] == 1_700_000_000_223_456_789
+    assert np.flatnonzero(~optical.valid).tolist() == [2]
+    np.testing.assert_allclose(optical.position[1, 0], 2.5e-3)
+    mixed = [*lines[:3], lines[3].replace(f"0{mark}8", f"0{other}8")]
+    with pytest.raises(RecordingError, match="decimal commas beside points"):
+        ndi.load(write(mixed))
+
+
 # ---------------------------------------------------------------------------------------------
 # Motive
 

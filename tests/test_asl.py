@@ -533,7 +533,7 @@ def test_sensor_yaml_that_cannot_be_used(euroc, text, message):
     [
         ("imu0", 5, f"{START + 15_000_003},0,0,oops,0,0,0", r"csv:5:w_RS_S_z: got 'oops'"),
         ("imu0", 5, f"{START + 15_000_003},0,0,0,0,0", r"csv:5: got 6 cells, expected 7"),
-        ("imu0", 5, f"{START + 15_000_003},0,0,0,0,,0", r"csv:5:a_RS_S_y: got nan"),
+        ("imu0", 5, f"{START + 15_000_003},0,0,0,0,,0", r"csv:5:a_RS_S_y: got ''"),
         ("imu0", 5, f"{START + 15_000_003},0,0,0,inf,0,0", r"csv:5:a_RS_S_x: got inf"),
         ("vicon0", 5, f"{START + 25_000_005},0,0,0,?,0,0,0", r"csv:5:q_RS_w: got '\?'"),
         ("vicon0", 1, POSE_HEADER.replace("q_RS_w", "s"), "csv:1: got a header without qw"),
@@ -559,7 +559,7 @@ def test_files_that_are_no_tables(euroc):
     with pytest.raises(RecordingError, match="0 samples"):
         asl.load(euroc)
     file.write_bytes(b"\xff\xfe\x00#\x81")
-    with pytest.raises(RecordingError, match="unreadable text"):
+    with pytest.raises(RecordingError, match="UTF-16"):
         asl.load(euroc)
 
 
@@ -590,7 +590,7 @@ def test_places_that_hold_no_recording(motion, tmp_path):
     for name in ("a", "b"):
         (tmp_path / f"{name}_imu.csv").write_text(motion.imu_table())
         (tmp_path / f"{name}_mocap.txt").write_text(motion.pose_table())
-    with pytest.raises(RecordingError, match=r"2 pairs of files \(a, b\)"):
+    with pytest.raises(RecordingError, match=r"2 recordings \(a, b\)"):
         asl.load(tmp_path)
     with pytest.raises(RecordingError, match="got a file"):
         asl.load(tmp_path / "a_imu.csv")

@@ -326,7 +326,7 @@ def test_samples_that_are_not_there(tmp_path):
     path = imu_bag(tmp_path / "c", spoil=lambda i: {"absent": [2] if i == 5 else []})
     again = ros.load(path)
     assert again.intake["imu"].masked["not finite"].numbers.tolist() == [5]
-    assert "1 messages say" in " ".join(again.info["assumptions"])
+    assert "1 messages state" in " ".join(again.info["assumptions"])
     path = imu_bag(tmp_path / "d", spoil=lambda i: {"absent": [1]})
     with pytest.raises(RecordingError, match=r"angular_velocity: got messages without it"):
         ros.load(path)

@@ -51,7 +51,7 @@ _ROOMS = {
     ),
     "jaxekf.io.importers": (
         "datasets.adis datasets.asl datasets.bag_files>_bag_files datasets.bags>_bags "
-        "datasets.broad datasets.columns>_columns datasets.exports>_exports datasets.formats "
+        "datasets.broad datasets.columns>_asl_columns datasets.exports>_exports datasets.formats "
         "datasets.ndi datasets.optitrack datasets.repoimu datasets.ros "
         "datasets.ros_messages>_ros_messages datasets.vicon"
     ),

@@ -7,13 +7,42 @@ import click
 
 from jaxekf.cli.console import json_option, note, overwrite_option, print_json, print_table
 from jaxekf.cli.options import Finite
-from jaxekf.io import run_folder
 from jaxekf.io.atomic import check_output
-from jaxekf.io.importers.formats import FORMATS, read
+from jaxekf.io.importers.formats import FORMATS, Option, read
 from jaxekf.recordings.facts import FILE
 from jaxekf.recordings.types import STREAMS, Recording
 
-_LIST = "\n".join(f"  {name:<10} {one.about}" for name, one in FORMATS.items())
+
+def _option(declared: dict[str, Option]) -> click.Option:
+    """The option of the command that some formats declare, by the formats' names."""
+    first = next(iter(declared.values()))
+    formats: dict[str, list[str]] = {}
+    for name, option in declared.items():
+        formats.setdefault(option.help, []).append(name)
+    text = "; ".join(f"{', '.join(names)}: {words}" for words, names in formats.items())
+    text += "; repeatable." if first.repeatable else "."
+    text += "" if first.default is None else f"  [default: {first.default}]"
+    if first.kind is bool:
+        return click.Option([first.flag, first.name], is_flag=True, help=text)
+    kind: Any = click.Choice(first.choices) if first.choices else first.kind
+    if first.bounds:
+        kind = Finite(*first.bounds, min_open=True)
+    return click.Option(
+        [first.flag, first.name],
+        type=kind,
+        nargs=len(first.values) or 1,
+        metavar=" ".join(first.values) or None,
+        multiple=first.repeatable,
+        help=text,
+    )
+
+
+_DECLARED: dict[str, dict[str, Option]] = {}
+"""For each option, the formats that declare it, with their declarations."""
+for _name, _form in FORMATS.items():
+    for _each in _form.options:
+        _DECLARED.setdefault(_each.name, {})[_name] = _each
+_LIST = "\n".join(f"  {name:<10} {form.summary}" for name, form in FORMATS.items())
 
 
 @click.command("import", epilog=f"\b\nFORMAT is one of:\n{_LIST}")
@@ -23,58 +52,25 @@ _LIST = "\n".join(f"  {name:<10} {one.about}" for name, one in FORMATS.items())
     "-o", "--output", metavar="RUN", required=True, type=click.Path(path_type=Path),
     help="Folder of the run.",
 )  # fmt: skip
-@click.option("--tool", help="Which tool, rigid body or object, where SRC holds several.")
-@click.option(
-    "--rate",
-    "rate_hz",
-    type=Finite(0.0, 1e6, min_open=True),
-    help="ndi: hertz at which frames are counted, where they have no time.  [default: 60]",
-)
-@click.option(
-    "--status-ok",
-    multiple=True,
-    help="ndi: a word or number of the state that means a good pose; repeatable, replaces the usual ones.",
-)
-@click.option("--imu", help="asl: stream of the IMU, by name or path; ros: its topic.")
-@click.option("--pose", help="asl: stream of the poses, by name or path; ros: their topic.")
-@click.option("--child-frame", help="ros: which of several transforms on one topic.")
-@click.option("--joint", help="ros: topic of the joint's angle, for truth; needs --axis.")
-@click.option("--joint-name", help="ros: which of several joints on one topic.")
-@click.option(
-    "--axis",
-    type=float,
-    nargs=3,
-    metavar="X Y Z",
-    help="ros: the joint's axis, in the tracker's frame.",
-)
-@click.option(
-    "--stamps",
-    type=click.Choice(["header", "receive"]),
-    help="ros: the headers' stamps, or when the recorder got each message.  [default: header]",
-)
-@click.option(
-    "--sort",
-    is_flag=True,
-    help="Put rows or messages in order of time that are not (not asl, broad, repoimu, adis).",
-)
 @overwrite_option
 @json_option
 def import_run(
     form: str, source: Path, output: Path, overwrite: bool, as_json: bool, **options: Any
 ) -> None:
-    """Write what another program recorded as a run: jaxekf import FORMAT SRC -o RUN.
+    """Convert a recording of another program to a run: jaxekf import FORMAT SRC -o RUN.
 
-    Prints what became of every row, and what was taken for granted; both also stand in recording.toml. A
-    tracker alone becomes a run by adding its imu.csv, on the same clock or within half a second of it.
+    Prints the account of every row and all assumptions, which are also in recording.toml. A tracker alone
+    becomes a run by adding its imu.csv, on the same clock or within half a second of it.
     """
+    from jaxekf.io import run_folder
+
     check_output(output, FILE, overwrite=overwrite)
     given = {key: value for key, value in options.items() if value not in (None, (), False)}
-    for key in given:
-        if key not in FORMATS[form].options:
-            taken = " or ".join(name for name, one in FORMATS.items() if key in one.options)
-            option = "--" + key.removesuffix("_hz").replace("_", "-")
+    for key, declared in _DECLARED.items():
+        if key in given and form not in declared:
+            flag = next(iter(declared.values())).flag
             raise click.UsageError(
-                f"got {option} with {form}, expected it with {taken} only; leave it out"
+                f"got {flag} with {form}, expected it with {' or '.join(declared)} only; leave it out"
             )
     recording = read(form, source, **given)
     run_folder.save(recording, output, overwrite=overwrite)
@@ -90,9 +86,13 @@ def import_run(
     for label, account in recording.intake.items():
         for text in account.sentences(label):
             click.echo(text)
-    click.echo("Taken for granted:")
+    click.echo("Assumptions:")
     for text in recording.info.get("assumptions", ()):
         click.echo(f"- {text}")
+
+
+# Before the options that other commands have too.
+import_run.params[3:3] = [_option(declared) for declared in _DECLARED.values()]
 
 
 def _counts(recording: Recording) -> dict[str, dict[str, int]]:

@@ -1,11 +1,11 @@
-"""CSV files as columns of numbers and exact times, with every fault named by its place."""
+"""CSV files as columns of numbers and exact times; errors name the file, line and column."""
 
 import csv
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.io._csv_text import Text, read_text
+from jaxekf.io._csv_times import (
+    CHUNK,
+    NUMBER,
+    format_seconds,
+    gather,
+    parse_seconds,
+    parsed_times,
+    scaled,
+)
 from jaxekf.recordings.accounts import Indices, Place
-from jaxekf.recordings.types import NANOSECONDS, Floats, Times
+from jaxekf.recordings.types import Floats, Times
 
 QUATERNION: tuple[str, ...] = ("qw", "qx", "qy", "qz")
 POSITION: tuple[str, ...] = ("x", "y", "z")
@@ -23,21 +32,17 @@ TIME_UNITS = {"s": 9, "ms": 6, "us": 3, "µs": 3, "μs": 3, "ns": 0}
 """Powers of ten of a nanosecond."""
 
 _PER_S = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
-_NUMBER = re.compile(
-    r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
-)
-_LONGEST_TIME = 30
 _LONGEST_WORD = 200
-_CHUNK = 1 << 16
-_LARGEST_NS = Decimal(2**63 - 1)
+_SPACES = re.compile(rb"(?:(?<=[,\n])|\A)[ \t]+(?=[,\n])")
+"""Cells that hold spaces only."""
 
 
 class Layout(NamedTuple):
-    """How the columns of a file are laid out, where that is not as documented."""
+    """Layout of a file's columns, if it differs from the documented one."""
 
     file: str | None = None
     columns: Mapping[str, str] | None = None
-    """Our name of a column and the file's."""
+    """This package's name of a column, and the file's."""
     header: tuple[str, ...] | None = None
     """Names of all columns, of a file that has none; blank for one that is not read."""
     skip_lines: int = 0
@@ -47,7 +52,7 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A CSV file: its columns, and the cells below them."""
+    """A CSV file: its columns by name, and the cells below them."""
 
     path: Path
     columns: tuple[str, ...]
@@ -57,44 +62,61 @@ class Table:
 
     @property
     def lines(self) -> Indices:
-        """(N,) number of the line of each row."""
+        """(N,) number of each row's line."""
         return self.text.lines
 
     @property
     def place(self) -> Place:
-        """Where its rows stand."""
+        """The file and the lines of its rows, for messages."""
         return Place(self.path, self.text.lines)
 
     def __len__(self) -> int:
         return len(self.text.lines)
 
     def cell(self, row: int, name: str) -> str:
-        """One cell, without blanks around it."""
+        """One cell, without spaces around it."""
         return self.text.cell(row, self.columns.index(name))
 
+    def number(self, row: int, name: str) -> str:
+        """One cell, a number's decimal mark as a point."""
+        cell = self.cell(row, name)
+        return cell.replace(",", ".") if self.text.decimal_commas else cell
+
+    def named(self, names: Mapping[int, str]) -> "Table":
+        """The same table with only these columns, by index, read."""
+        columns = tuple(names.get(i, "") for i in range(len(self.columns)))
+        return replace(self, columns=columns)
+
+    def take(self, chosen: NDArray[np.bool_]) -> "Table":
+        """The rows that a mask (N,) chooses."""
+        return replace(self, text=self.text.take(chosen))
+
     def error(self, row: int, column: str, got: str, expected: str, hint: str) -> RecordingError:
-        """A fault in one row."""
+        """The error of one cell."""
         return RecordingError(
             self.path, got, expected, hint, line=int(self.lines[row]), column=column
         )
 
 
 class Sheet(NamedTuple):
-    """What a CSV file is written from."""
+    """Content of a CSV file to be written."""
 
     columns: Sequence[str]
     """Names of all columns after ``time``."""
     time_ns: Times
     values: Floats
-    """(N, columns), without the column of words; NaN is written as a blank cell."""
+    """(N, columns) without the column of words; NaN is written as a blank cell."""
     words: Sequence[str] | None = None
-    """(N,) texts of the first column after ``time``, where that is not a number."""
+    """(N,) texts of the first column after ``time``, if it is not a number."""
 
 
 def read_table(path: Path, layout: Layout | None = None) -> Table:
-    """Read a file, its columns by the names that `layout` gives them.
+    """Read a file; `layout` gives the names of its columns.
 
-    Raises `RecordingError` for what `read_text` refuses, and for columns twice or not there.
+    Raises
+    ------
+    RecordingError
+        As `read_text` does, and if a column is missing or present twice.
     """
     how = layout or Layout()
     text = read_text(path, skip_lines=how.skip_lines, header=how.header, delimiter=how.delimiter)
@@ -122,13 +144,13 @@ def read_table(path: Path, layout: Layout | None = None) -> Table:
 
 
 def _renamed(text: Text, columns: Mapping[str, str]) -> tuple[str, ...]:
-    """Our names of the columns that the file calls so; blank for the others."""
+    """This package's name of each of the file's columns; blank for a column that is not read."""
     missing = [theirs for theirs in columns.values() if theirs not in text.header]
     if missing:
         raise RecordingError(
             text.path,
             f"columns {','.join(text.header)}",
-            f"among them {','.join(missing)}, as recording.toml says",
+            f"among them {','.join(missing)}, as recording.toml states",
             "correcting the names under columns in recording.toml",
             line=text.header_line,
         )
@@ -145,9 +167,9 @@ def _renamed(text: Text, columns: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def need_columns(table: Table, *layouts: str) -> None:
-    """The columns are those of a layout as it is documented, such as ``time,angle[,scored]``.
+    """Raise unless the columns are those of a documented layout, such as ``time,angle[,scored]``.
 
-    What stands in one pair of brackets is there whole or not at all; the order is free.
+    Columns in one pair of brackets are present together or absent together; the order is free.
     """
     known = {name for name in table.columns if name}
     for layout in layouts:
@@ -169,7 +191,7 @@ def need_columns(table: Table, *layouts: str) -> None:
 
 
 def need_time(table: Table) -> None:
-    """There is a column ``time``, whatever else there is."""
+    """Raise unless there is a column ``time``."""
     if "time" not in table.columns:
         raise RecordingError(
             table.path,
@@ -183,44 +205,59 @@ def need_time(table: Table) -> None:
 def numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
     """Columns as float64 (N, len(names)); with `blank`, empty cells are NaN."""
     at = [table.columns.index(name) for name in names]
-    raw = table.text.data
+    raw = table.text.with_decimal_points()
     if blank and table.text.has_blank:
-        raw = _nan_for_blank(raw)
+        raw = _nan_for_empty(raw)
     try:
-        return np.loadtxt(
-            io.TextIOWrapper(io.BytesIO(raw), "utf-8"),
-            delimiter=",",
-            usecols=at,
-            comments=None,
-            ndmin=2,
-        )
+        return _loaded(raw, at)
+    except ValueError:
+        if not blank:
+            return _one_by_one(table, names, blank)
+    try:
+        # Some empty cells may hold spaces.
+        return _loaded(_SPACES.sub(b"nan", raw), at)
     except ValueError:
         return _one_by_one(table, names, blank)
 
 
-def _nan_for_blank(raw: bytes) -> bytes:
-    """Cells without anything as ``nan``."""
+def _loaded(raw: bytes, columns: Sequence[int]) -> Floats:
+    return np.loadtxt(
+        io.TextIOWrapper(io.BytesIO(raw), "utf-8"),
+        delimiter=",",
+        usecols=columns,
+        comments=None,
+        ndmin=2,
+    )
+
+
+def _nan_for_empty(raw: bytes) -> bytes:
+    """Empty cells as ``nan``."""
     if b",," in raw:
-        # Twice, for the second of three in a row ends where the first match does.
+        # Twice: a match ends where the next of three commas in a row would begin.
         raw = raw.replace(b",,", b",nan,").replace(b",,", b",nan,")
     if b",\n" in raw:
         raw = raw.replace(b",\n", b",nan\n")
-    return raw.replace(b"\n,", b"\nnan,") if b"\n," in raw else raw
+    raw = raw.replace(b"\n,", b"\nnan,") if b"\n," in raw else raw
+    return b"nan" + raw if raw.startswith(b",") else raw
 
 
 def _one_by_one(table: Table, names: Sequence[str], blank: bool) -> Floats:
-    """The same cell by cell, to say which is none, and for numbers with blanks around them."""
+    """Columns read cell by cell, which names the first cell that is not a number."""
     values = np.empty((len(table), len(names)))
     for j, name in enumerate(names):
         for i in range(len(table)):
-            cell = table.cell(i, name)
+            cell = table.number(i, name)
             if blank and not cell:
                 values[i, j] = np.nan
-            elif _NUMBER.fullmatch(cell):
+            elif NUMBER.fullmatch(cell):
                 values[i, j] = float(cell)
             else:
-                raise table.error(i, name, f"'{cell}'", "a number", "correcting the cell")
+                raise _not_a_number(table, i, name)
     return values
+
+
+def _not_a_number(table: Table, row: int, name: str) -> RecordingError:
+    return table.error(row, name, f"'{table.cell(row, name)}'", "a number", "correcting the cell")
 
 
 def finite_numbers(table: Table, names: tuple[str, ...]) -> Floats:
@@ -234,7 +271,7 @@ def finite_numbers(table: Table, names: tuple[str, ...]) -> Floats:
 
 
 def whole_or_blank(table: Table, names: Sequence[str]) -> Floats:
-    """Columns (N, len(names)): in each row finite numbers, or NaN where all of its cells are blank."""
+    """Columns (N, len(names)): each row holds finite numbers, or NaN if all its cells are blank."""
     values = numbers(table, names, blank=True)
     blank = np.isnan(values)
     bad = np.flatnonzero((blank.any(axis=1) & ~blank.all(axis=1)) | np.isinf(values).any(axis=1))
@@ -245,14 +282,14 @@ def whole_or_blank(table: Table, names: Sequence[str]) -> Floats:
             row,
             ",".join(names),
             f"'{','.join(cells)}'",
-            f"{len(names)} finite numbers, or {len(names)} blank cells for what is not known",
+            f"{len(names)} finite numbers, or {len(names)} blank cells for unknown values",
             "completing or blanking them",
         )
     return values
 
 
 def reported(table: Table, name: str, least: float = -np.inf) -> Floats | None:
-    """A column (N,) of finite numbers not below `least`, NaN where blank; None without the column."""
+    """A column (N,) of finite numbers of at least `least`, NaN for blank cells; None without the column."""
     if name not in table.columns:
         return None
     values = numbers(table, (name,), blank=True)[:, 0]
@@ -264,80 +301,68 @@ def reported(table: Table, name: str, least: float = -np.inf) -> Floats | None:
             name,
             f"{values[row]}",
             "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more",
-            "blanking the cell, which means that none was reported",
+            "blanking the cell, which means that no value was reported",
         )
     return values
 
 
 def words(table: Table, name: str) -> NDArray[np.str_]:
-    """A column (N,) of texts, without blanks around them."""
+    """A column (N,) of texts, without spaces around them."""
     at = table.columns.index(name)
     begin, end = table.text.begins(at), table.text.ends[:, at]
     width = int((end - begin).max(initial=1))
     if width > _LONGEST_WORD:
         return np.array([table.cell(i, name) for i in range(len(table))], str)
     rows = [
-        _gather(table.text.data, begin[i : i + _CHUNK], end[i : i + _CHUNK], width)
-        for i in range(0, len(table), _CHUNK)
+        gather(table.text.data, begin[i : i + CHUNK], end[i : i + CHUNK], width)
+        for i in range(0, len(table), CHUNK)
     ]
     cells = np.concatenate(rows).view(f"S{width}")[:, 0]
     _, first, which = np.unique(cells, return_index=True, return_inverse=True)
     return np.array([table.cell(int(row), name) for row in first], str)[which]
 
 
-def _gather(
-    data: bytes, begin: NDArray[np.int64], end: NDArray[np.int64], width: int
-) -> NDArray[np.uint8]:
-    """(n, width) bytes of cells, filled up with zeros."""
-    flat = np.frombuffer(data, np.uint8)
-    at = begin[:, None] + np.arange(width)
-    inside = at < end[:, None]
-    return np.where(inside, flat[np.minimum(at, len(flat) - 1)], 0).astype(np.uint8)
-
-
-def parse_seconds(text: str, exponent: int = 9) -> int:
-    """Decimal seconds, or other units by their `exponent`, to nanoseconds, exactly; what is beyond is
-    rounded. Raises `ValueError` for what is no time within the 64 bits of nanoseconds."""
-    whole, _, part = text.partition(".")
-    digits = (whole + part).isascii() and whole.isdigit() and (part.isdigit() or not part)
-    if exponent == 9 and digits and len(whole) < 10 and len(part) <= 9:
-        return int(whole) * NANOSECONDS + int(part.ljust(9, "0") or 0)
-    if not _NUMBER.fullmatch(text):
-        raise ValueError(text)
-    value = Decimal(text)
-    if not value.is_finite() or value.adjusted() > 20:
-        raise ValueError(text)
-    value = value.scaleb(exponent).to_integral_value()
-    if not -_LARGEST_NS - 1 <= value <= _LARGEST_NS:
-        raise ValueError(text)
-    return int(value)
-
-
 def stamps(table: Table) -> Times:
-    """The column ``time`` (N,) in nanoseconds, in whatever order."""
-    at = table.columns.index("time")
+    """The column ``time`` (N,) in nanoseconds, in any order."""
     exponent = TIME_UNITS[table.time_unit]
-    begin, end = table.text.begins(at), table.text.ends[:, at]
-    times = np.zeros(len(table), np.int64)
-    for i in range(0, len(table), _CHUNK):
-        chunk = slice(i, i + _CHUNK)
-        found, plain = _plain_times(table.text.data, begin[chunk], end[chunk], exponent)
-        times[chunk] = found
-        for row in np.flatnonzero(~plain):
-            cell = table.cell(i + int(row), "time")
-            try:
-                times[i + row] = parse_seconds(cell, exponent)
-            except (InvalidOperation, ValueError, OverflowError):
-                raise _no_time(table, i + int(row), cell) from None
-    return times
+
+    def parsed(row: int) -> int:
+        try:
+            return parse_seconds(table.number(row, "time"), exponent)
+        except ValueError:
+            raise _no_time(table, row) from None
+
+    return parsed_times(
+        table.text, table.columns.index("time"), Decimal(1).scaleb(exponent), parsed
+    )
 
 
-def _no_time(table: Table, row: int, cell: str) -> RecordingError:
-    """What is wrong with a cell that is no time; of numbers beyond 292 years, what unit they may be in."""
+def times_or_blank(
+    table: Table, name: str, unit_ns: int | Decimal
+) -> tuple[Times, NDArray[np.bool_]]:
+    """A column (N,) of times in units of `unit_ns` nanoseconds, exact, and which cells are not blank."""
+    known = np.ones(len(table), bool)
+
+    def parsed(row: int) -> int:
+        cell = table.number(row, name)
+        known[row] = bool(cell)
+        try:
+            return scaled(cell, Decimal(unit_ns)) if cell else 0
+        except ValueError:
+            if not NUMBER.fullmatch(cell):
+                raise _not_a_number(table, row, name) from None
+            raise table.error(row, name, f"'{cell}'", "a time", "correcting the cell") from None
+
+    return parsed_times(table.text, table.columns.index(name), Decimal(unit_ns), parsed), known
+
+
+def _no_time(table: Table, row: int) -> RecordingError:
+    """The error of a cell that is not a time; for one beyond 292 years, with the unit it may have."""
     unit, hint = table.time_unit, "correcting the cell"
-    if _NUMBER.fullmatch(cell) and Decimal(cell).is_finite() and len(table) > 1:
-        other = table.cell(row - 1 if row else 1, "time")
-        if _NUMBER.fullmatch(other) and Decimal(other).is_finite():
+    cell = table.number(row, "time")
+    if NUMBER.fullmatch(cell) and Decimal(cell).is_finite() and len(table) > 1:
+        other = table.number(row - 1 if row else 1, "time")
+        if NUMBER.fullmatch(other) and Decimal(other).is_finite():
             step = abs(Decimal(cell) - Decimal(other))
             fits = [u for u in ("ms", "µs", "ns") if 5e-5 < float(step) / _PER_S[u] < 0.5]
             hint = f'stating the unit of its times: time_unit = "{fits[0]}"' if fits else hint
@@ -345,33 +370,15 @@ def _no_time(table: Table, row: int, cell: str) -> RecordingError:
     return table.error(row, "time", f"'{cell}'", f"a time in {expected}, within 292 years", hint)
 
 
-def _plain_times(
-    data: bytes, begin: NDArray[np.int64], end: NDArray[np.int64], exponent: int
-) -> tuple[Times, NDArray[np.bool_]]:
-    """Times of cells that are digits with at most one point, and which cells are."""
-    width = int((end - begin).max(initial=1))
-    plain = (end > begin) & (end - begin <= 19)
-    cells = _gather(data, begin, end, min(width, 19))
-    value = np.zeros(len(begin), np.int64)
-    digits, decimals = np.zeros((2, len(begin)), np.int64)
-    after = np.zeros(len(begin), bool)
-    for column in cells.T:
-        digit = (column >= 48) & (column <= 57)
-        point = column == 46
-        plain &= digit | (point & ~after) | (column == 0)
-        value = np.where(digit, value * 10 + (column - 48), value)
-        digits += digit
-        decimals += digit & after
-        after |= point
-    power = exponent - decimals
-    # Digits and zeros together stay below 2**63; a fraction of a nanosecond has to be rounded.
-    plain &= (digits > 0) & (power >= 0) & (digits + power <= 18)
-    return np.where(plain, value * 10 ** np.clip(power, 0, 18), 0), plain
-
-
 def read_times(table: Table, *, repeated: bool = False) -> Times:
-    """The column ``time`` (N,), which increases; with `repeated`, rows that follow may share a time."""
+    """The column ``time`` (N,), which increases; with `repeated`, consecutive rows may share a time."""
     times = stamps(table)
+    check_increasing(table, times, repeated=repeated)
+    return times
+
+
+def check_increasing(table: Table, times: Times, *, repeated: bool = False) -> None:
+    """Raise at the first time (N,) that does not increase; with `repeated`, at the first that decreases."""
     step = np.diff(times)
     backwards = np.flatnonzero(step < 0 if repeated else step <= 0)
     if backwards.size:
@@ -383,33 +390,24 @@ def read_times(table: Table, *, repeated: bool = False) -> Times:
             "times that do not decrease" if repeated else "times that increase",
             "sorting the rows" if repeated else "sorting the rows and removing duplicates",
         )
-    return times
 
 
 def flags(table: Table, name: str) -> NDArray[np.bool_]:
-    """A column (N,) of which other numbers than 0 are true; all true without it."""
+    """A column (N,), true for numbers other than 0; all true without the column."""
     if name not in table.columns:
         return np.ones(len(table), bool)
     return finite_numbers(table, (name,))[:, 0] != 0.0
 
 
-def format_seconds(time_ns: int, decimals: int = 0) -> str:
-    """Nanoseconds as decimal seconds, exactly; trailing zeros only to fill so many `decimals`."""
-    sign, size = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
-    whole, part = divmod(int(size), NANOSECONDS)
-    digits = f"{part:09d}".rstrip("0").ljust(decimals, "0")
-    return f"{sign}{whole}.{digits}" if digits else f"{sign}{whole}"
-
-
 def write_csv(
     path: Path, columns: Sequence[str], time_ns: Times, values: Floats, digits: int
 ) -> None:
-    """A CSV file of a time column and numbers; NaN is written as a blank cell."""
+    """Write a CSV file of a time column and numbers; NaN becomes a blank cell."""
     write_sheet(path, Sheet(columns, time_ns, values), digits)
 
 
 def write_sheet(path: Path, sheet: Sheet, digits: int) -> None:
-    """A CSV file of a time column, maybe one of words, and numbers with so many digits."""
+    """Write a CSV file of a time column, perhaps one of words, and numbers of `digits` digits."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["time", *sheet.columns])

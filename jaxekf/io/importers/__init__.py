@@ -1,6 +1,7 @@
 """Recordings of other programs, read as `Recording`.
 
-Each public module has a `load`. A new format is a file here and an entry in `formats.FORMATS`.
+Each public module has a `load`. A new format is a module here and an entry in `formats.FORMATS`, which
+declares the options of `jaxekf import`. CSV exports are read by `_exports`.
 """
 
 from jaxekf._support.lazy import attributes

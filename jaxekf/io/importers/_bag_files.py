@@ -1,4 +1,4 @@
-"""What of the files of a bag can be told without the library that reads them."""
+"""Files of a bag examined without the library that reads them: sizes, truncation, databases."""
 
 import re
 import sqlite3
@@ -17,20 +17,20 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 def sizes(path: Path) -> str:
-    """Stored and actual size where a file shows that it was cut, or the actual, as words to append."""
+    """Sizes of the files, stated and actual, as words to append to a message."""
     files = sorted(path.glob("*.[dm][bc]*")) if path.is_dir() else [path]
     found = []
     for file in files:
-        said = _cut(file)
-        if not said and file.is_file():
-            said = f"has {file.stat().st_size} bytes"
-        if said:
-            found.append(f"{file.name} {said}" if path.is_dir() else f"it {said}")
+        size = _truncation(file)
+        if not size and file.is_file():
+            size = f"has {file.stat().st_size} bytes"
+        if size:
+            found.append(f"{file.name} {size}" if path.is_dir() else f"it {size}")
     return f"; {', '.join(found)}" if found else ""
 
 
-def _cut(file: Path) -> str:
-    """How a file shows that it was cut, or nothing."""
+def _truncation(file: Path) -> str:
+    """Evidence that a file is truncated, in words; blank without any."""
     try:
         size = file.stat().st_size
         with file.open("rb") as stream:
@@ -56,7 +56,7 @@ def _cut(file: Path) -> str:
 
 
 def _sqlite_pages(head: bytes) -> tuple[int, int]:
-    """Number and size of the pages that the head of a database states; 0 pages where it is not kept."""
+    """Number and size of the pages that a database states; 0 pages if the number is not up to date."""
     page = int.from_bytes(head[16:18], "big")
     # The number holds only where whoever wrote last kept it.
     kept = head[24:28] == head[92:96]
@@ -64,7 +64,7 @@ def _sqlite_pages(head: bytes) -> tuple[int, int]:
 
 
 def check_database(file: Path) -> None:
-    """Raise where a database was cut, or where its last messages are in a file beside it."""
+    """Raise if a database is truncated, or if its last messages are still in its log file."""
     with file.open("rb") as stream:
         head = stream.read(100)
     if not head.startswith(_SQLITE_MAGIC):
@@ -77,11 +77,11 @@ def check_database(file: Path) -> None:
             "one that was closed",
             f"`sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'`, and `ros2 bag reindex`",
         )
-    said = _cut(file)
-    if said:
+    truncation = _truncation(file)
+    if truncation:
         raise RecordingError(
             file,
-            f"a database that {said}",
+            f"a database that {truncation}",
             "an SQLite file of a ROS 2 bag that is whole",
             "copying it again, or `sqlite3 FILE .recover`",
         )
@@ -118,7 +118,7 @@ class EmptyDefinitions:
 
     @classmethod
     def instead(cls, path: Path, error: KeyError) -> "EmptyDefinitions":
-        """Of a bag that the library does not open for this error, which is raised where it is another."""
+        """A bag that the library refuses for this error, which is raised again if the cause is another."""
         files = [path]
         if path.is_dir():
             about = yaml.safe_load((path / "metadata.yaml").read_text("utf-8"))

@@ -1,7 +1,7 @@
 """ROS 1 bags, ROS 2 bags and single MCAP or SQLite files as topics of messages, without ROS.
 
 They are read by the library `rosbags`. Messages are taken by their standard definitions, not by those in
-the file: a type that nobody knows does not stand in the way of the others, and no code is made of a file.
+the file: an unknown type does not prevent reading the others, and no code is generated from a file.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ class Topic(NamedTuple):
     type: str
     """Such as ``sensor_msgs/msg/Imu``, of ROS 1 too."""
     stated: int
-    """Messages, as the bag states it."""
+    """Number of messages that the bag states."""
 
 
 class Bag:
@@ -44,13 +44,13 @@ class Bag:
         self.topics = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
 
     def place(self, topic: Topic) -> str:
-        """Where its messages stand, as messages about them say it."""
+        """The topic's place in error messages."""
         return f"{self.path}:{topic.name}"
 
     def messages(self, topic: Topic) -> Iterator[tuple[int, Any]]:
-        """Time of receipt, ns, and message, in the order of receipt.
+        """Time of receipt, ns, and message, in order of receipt.
 
-        Raises `RecordingError` where one cannot be read, and where there are fewer than the bag states.
+        Raises `RecordingError` if one cannot be read, or if there are fewer than the bag states.
         """
         chosen = [
             connection
@@ -72,11 +72,11 @@ class Bag:
                 self.place(topic),
                 f"{count} messages{sizes(self.path)}",
                 f"the {topic.stated} that the bag states",
-                _mending(self.path),
+                _remedy(self.path),
             )
 
     def _check_definition(self, topic: Topic, connections: list[Any]) -> None:
-        """Raise where the file says that its type of this name is not the standard one."""
+        """Raise if the file's type of this name is not the standard one."""
         if self._ros1:
             known = self._types.generate_msgdef(topic.type)[1]
             stated = {c.digest for c in connections} - {"", "*", None}
@@ -96,7 +96,7 @@ class Bag:
 def opened(path: Path) -> Iterator[Bag]:
     """A bag, closed at the end.
 
-    Raises `RecordingError` where it is not there, cannot be read, or `rosbags` is not installed.
+    Raises `RecordingError` if it is missing or cannot be read, or if `rosbags` is not installed.
     """
     try:
         _check_place(path)
@@ -124,19 +124,19 @@ def opened(path: Path) -> Iterator[Bag]:
 
 
 def unreadable(path: Path, error: Exception, part: str = "") -> RecordingError:
-    """The error of a bag that the library does not read, with its reason and the sizes that are known."""
+    """The error of a bag that the library cannot read, with its reason and the known sizes."""
     reason = " ".join(str(error).split()).rstrip(".")
     if isinstance(error, (LookupError, AssertionError)) or not reason:
         reason = f"{type(error).__name__} {reason}".strip()
     kind = "a readable ROS 2 bag" if path.is_dir() else f"{KINDS[path.suffix]} that is whole"
     place = f"{path}:{part}" if part else path
     return RecordingError(
-        place, f"something that cannot be read ({reason}){sizes(path)}", kind, _mending(path)
+        place, f"something that cannot be read ({reason}){sizes(path)}", kind, _remedy(path)
     )
 
 
-def _mending(path: Path) -> str:
-    """What may help with a bag that is not whole."""
+def _remedy(path: Path) -> str:
+    """Remedies for an incomplete bag."""
     other = "mcap recover" if path.suffix == ".mcap" else "ros2 bag reindex"
     return f"copying it again, or `{'rosbag reindex' if _is_ros1(path) else other}`"
 
@@ -146,7 +146,7 @@ def _is_ros1(path: Path) -> bool:
 
 
 def _check_place(path: Path) -> None:
-    """Raise where there is nothing that could be a bag."""
+    """Raise if the path cannot be a bag."""
     if not path.exists():
         raise RecordingError(path, "no such file or folder", _WANTED, "another path")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
@@ -194,7 +194,7 @@ def _reader(path: Path) -> tuple[Any, Any]:
 
 
 def _check_total(path: Path, reader: Any) -> None:
-    """Raise where a description that was cut short still reads, but with topics missing."""
+    """Raise for a truncated description that can be read but lacks topics."""
     listed = sum(connection.msgcount for connection in reader.connections)
     if listed < reader.message_count:
         place = path / "metadata.yaml" if path.is_dir() else path
@@ -202,7 +202,7 @@ def _check_total(path: Path, reader: Any) -> None:
             place,
             f"topics of {listed} messages in all",
             f"the {reader.message_count} that it states",
-            _mending(path),
+            _remedy(path),
         )
 
 

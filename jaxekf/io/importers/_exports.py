@@ -1,356 +1,239 @@
-"""Text exports of other programs: lines of cells with headers of their own, plain or gzipped.
+"""CSV exports of other programs: header lines, the table below them, and what its importers share.
 
-Every fault is named by file, line and column. A last line that is cut short is left out; a ragged one
-before it is an error.
+Errors name file, line and column. A last line that is truncated is left out and accounted for.
 """
 
-import csv
-import gzip
 import re
-import zlib
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
-from decimal import Decimal
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.io._csv_content import Content, read_content
+from jaxekf.io._csv_text import DELIMITERS, read_rows, split_line
+from jaxekf.io.csv_table import Table, numbers
 from jaxekf.recordings import screening
-from jaxekf.recordings.accounts import Indices, Intake, Place, Reason
+from jaxekf.recordings.accounts import Intake, Reason
 from jaxekf.recordings.types import Flags, Floats, Optical, Recording, Times
 
 METRES = {"m": 1.0, "meters": 1.0, "cm": 0.01, "centimeters": 0.01, "mm": 1e-3, "millimeters": 1e-3}
 """Metres in a unit of length."""
 LARGEST = 1e20
-"""What is larger is no number but a mark that there is none (NDI writes -3.697314e28)."""
-_NUMBER = re.compile(
-    r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE
-)
-_ENCODINGS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16"}
-_HEAD = 30
-"""Lines within which a header must stand."""
-_DELIMITERS = {",": "comma", ";": "semicolon", "\t": "tab"}
-_SHOWN = 12
+"""A larger number marks a missing value (NDI writes -3.697314e28)."""
+_HEADER_LINES = 30
+"""Lines at the top of a file among which its header must be."""
 
 
-class Cells(Sequence[list[str]]):
-    """Lines as lists of cells, taken apart when they are asked for: a long export has millions."""
+class HeaderLine(NamedTuple):
+    """A line above the samples."""
 
-    def __init__(self, texts: list[str], delimiter: str) -> None:
-        self.texts, self.delimiter = texts, delimiter
+    number: int
+    cells: list[str]
+    """Without spaces around them, and without blank ones at the end."""
+    end: int
+    """Offset of the next line."""
 
-    def __len__(self) -> int:
-        return len(self.texts)
-
-    @overload
-    def __getitem__(self, at: int) -> list[str]: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[list[str]]: ...
-    def __getitem__(self, at: int | slice) -> list[str] | list[list[str]]:
-        if isinstance(at, slice):
-            return [self._row(text) for text in self.texts[at]]
-        return self._row(self.texts[at])
-
-    def _row(self, text: str) -> list[str]:
-        row = text.split(self.delimiter)
-        if '"' in text:
-            # What is quoted beyond measure is left as it stands, to be refused as no number.
-            with suppress(csv.Error):
-                row = next(csv.reader([text], delimiter=self.delimiter))
-        return [cell.strip() for cell in row]
+    def cell(self, column: int) -> str:
+        """One cell; blank beyond the last one."""
+        return self.cells[column] if column < len(self.cells) else ""
 
 
-class Lines(NamedTuple):
-    """A file as lines of cells, without blank ones."""
+class Export(NamedTuple):
+    """The text of an export, and its first lines."""
 
-    path: Path
-    cells: Cells
-    """Cells of each line, without blanks around them."""
-    numbers: list[int]
-    """Number of each line in the file."""
+    content: Content
     delimiter: str
+    head: list[HeaderLine]
+    """The first lines that are not blank."""
 
-    def find(self, words: Sequence[str], what: str) -> int:
-        """The first line near the top that has all of these words among its columns' names, in any case."""
-        wanted = {word.lower() for word in words}
-        for i, row in enumerate(self.cells[:_HEAD]):
-            if wanted <= {bare(cell) for cell in row}:
-                return i
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.content.path
+
+    def lines(self, begin: int, count: int) -> list[HeaderLine]:
+        """The next lines from an offset that are not blank, at most `count`."""
+        found: list[HeaderLine] = []
+        while len(found) < count and begin < len(self.content.data):
+            cells, end = split_line(self.content, begin, self.delimiter)
+            row = stripped(cells)
+            if row:
+                found.append(HeaderLine(self.content.line(begin), row, end))
+            begin = end
+        return found
+
+    def find(self, names: Sequence[str], expected: str) -> HeaderLine:
+        """The first of the head's lines with all these column names, in any case."""
+        for line in self.head:
+            if {name.lower() for name in names} <= {bare(cell) for cell in line.cells}:
+                return line
         raise RecordingError(
             self.path,
-            f"no line with {', '.join(words)} among the first {min(_HEAD, len(self.cells))}",
-            what,
+            f"no line with {', '.join(names)} among the first {len(self.head)}",
+            expected,
             "another file, or exporting again with quaternions and positions",
         )
 
-    def body(self, header: int, width: int) -> "Rows":
-        """The rows of samples below a header line, each `width` cells wide at most."""
-        return _rows(self, header + 1, len(self.cells), width)
+    def table(self, header: HeaderLine, width: int, end: int | None = None) -> Table:
+        """The rows below a header, up to an offset; the columns are called by their number."""
+        names = tuple(map(str, range(1, width + 1)))
+        text = read_rows(
+            self.content, header.end, names, self.delimiter, end=end, header_line=header.number
+        )
+        return Table(self.path, names, text)
 
-    def until_blank(self, header: int, width: int) -> "Rows":
-        """The same, up to the first blank line."""
-        end = header + 1
-        while end < len(self.cells) and self.numbers[end] == self.numbers[end - 1] + 1:
-            end += 1
-        return _rows(self, header + 1, end, width)
+    def error(
+        self, line: HeaderLine, got: str, expected: str, hint: str, column: str | None = None
+    ) -> RecordingError:
+        """The error of a header line."""
+        return RecordingError(self.path, got, expected, hint, line=line.number, column=column)
 
 
-class Rows(NamedTuple):
-    """Rows of samples, of equal width."""
+def read_export(path: Path | str, expected: str) -> Export:
+    """Read an export; `expected` describes it in messages.
 
-    path: Path
-    cells: Cells
-    numbers: Indices
-    """(N,) number of the line of each."""
-    cut: tuple[int, ...]
-    """Lines that end too early, at the end of the file."""
-
-    @property
-    def place(self) -> Place:
-        return Place(self.path, self.numbers)
-
-    def take(self, chosen: Flags) -> "Rows":
-        """Some of the rows."""
-        texts = [text for text, keep in zip(self.cells.texts, chosen, strict=True) if keep]
-        cells = Cells(texts, self.cells.delimiter)
-        return Rows(self.path, cells, self.numbers[chosen], self.cut)
-
-    def words(self, column: int) -> list[str]:
-        """Texts (N,) of a column."""
-        return [row[column] for row in self.cells]
-
-    def floats(self, columns: Sequence[int], labels: Sequence[str]) -> Floats:
-        """Columns (N, len(columns)) as numbers, NaN where blank. Raises `RecordingError` at a text."""
-        values = np.full((len(self.cells), len(columns)), np.nan)
-        for i, row in enumerate(self.cells):
-            for j, column in enumerate(columns):
-                if row[column]:
-                    values[i, j] = float(self._number(i, row[column], labels[j]))
-        return values
-
-    def times(self, column: int, label: str, nanoseconds: int | Decimal) -> tuple[Times, Flags]:
-        """Stamps (N,) of a column in units of so many nanoseconds, exactly, and which rows have one."""
-        times, known = np.zeros(len(self.cells), np.int64), np.zeros(len(self.cells), bool)
-        for i, row in enumerate(self.cells):
-            cell = row[column]
-            if not cell:
-                continue
-            value = Decimal(self._number(i, cell, label)) * nanoseconds
-            if not value.is_finite() or abs(value) >= 2**63:
-                raise self.place.error(i, label, f"'{cell}'", "a time", "correcting the cell")
-            times[i], known[i] = int(value.to_integral_value()), True
-        return times, known
-
-    def _number(self, row: int, cell: str, label: str) -> str:
-        if not _NUMBER.fullmatch(cell):
-            raise self.place.error(row, label, f"'{cell}'", "a number", "correcting the cell")
-        return cell if self.cells.delimiter == "," else cell.replace(",", ".")
+    Raises
+    ------
+    RecordingError
+        If the file is missing, a folder, empty or not text in UTF-8.
+    """
+    content = read_content(Path(path), expected)
+    top = b"\n".join(content.data.split(b"\n", _HEADER_LINES)[:_HEADER_LINES])
+    delimiter = max(DELIMITERS, key=lambda mark: (top.count(mark.encode()), mark == ","))
+    export = Export(content, delimiter, [])
+    head = export.lines(0, _HEADER_LINES)
+    if not head:
+        raise RecordingError(
+            content.path, "an empty file", expected, "exporting the recording again"
+        )
+    return export._replace(head=head)
 
 
 def bare(cell: str) -> str:
-    """A column's name in lower case, without a unit behind it and without marks: ``Tx [mm]`` is ``tx``."""
+    """A column's name in lower case without its unit and marks: ``Tx [mm]`` is ``tx``."""
     return re.sub(r"\s*[\[(].*[\])]\s*$", "", cell).strip().rstrip("#:").strip().lower()
 
 
 def unit_of(cell: str) -> str | None:
-    """The unit behind a column's name, in lower case; None where there is none."""
+    """The unit after a column's name, in lower case; None without one."""
     found = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]\s*$", cell)
     return found[1].lower() if found and found[1] else None
 
 
-def length_unit(lines: Lines, at: int, unit: str, column: str) -> float:
-    """Metres in a unit that a header states. Raises `RecordingError` for one that is not known."""
+def length_unit(export: Export, line: HeaderLine, unit: str, column: str) -> float:
+    """Metres in a unit that a header line states; raises for an unknown unit."""
     if unit.lower() not in METRES:
-        raise RecordingError(
-            lines.path,
-            f"the unit of length '{unit}'",
-            "m, cm or mm",
-            "exporting in millimetres",
-            line=lines.numbers[at],
-            column=column,
+        raise export.error(
+            line, f"the unit of length '{unit}'", "m, cm or mm", "exporting in millimetres", column
         )
     return METRES[unit.lower()]
 
 
-def read_lines(path: Path | str, what: str) -> Lines:
-    """A file's lines as cells; `what` says in messages what it should be.
-
-    Raises `RecordingError` where it is not there, a folder, empty or not text in UTF-8.
-    """
-    path = Path(path)
-    text = _text(path, what)
-    if not text.strip():
-        raise RecordingError(path, "an empty file", what, "exporting the recording again")
-    counted = "\n".join(text.splitlines()[:_HEAD])
-    delimiter = max(_DELIMITERS, key=lambda d: (counted.count(d), d == ","))
-    texts, numbers = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.replace(delimiter, "").strip():
-            texts.append(line)
-            numbers.append(number)
-    if not texts:
-        raise RecordingError(path, "an empty file", what, "exporting the recording again")
-    return Lines(path, Cells(texts, delimiter), numbers, delimiter)
-
-
-def _text(path: Path, what: str) -> str:
-    if path.is_dir():
-        inside = sorted(child.name for child in path.iterdir() if child.is_file())
-        told = ", ".join(inside[:_SHOWN]) + (", ..." if len(inside) > _SHOWN else "")
-        got = f"a folder that holds {told}" if inside else "a folder without files"
-        raise RecordingError(path, got, what, "naming one file in it")
-    if not path.is_file():
-        raise RecordingError(path, "no such file", what, "another path")
-    try:
-        raw = path.read_bytes()
-        raw = gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw
-    except (OSError, EOFError, zlib.error) as error:
-        raise RecordingError(
-            path, f"a file that cannot be read ({error})", what, "fetching it again"
-        ) from error
-    for mark, name in _ENCODINGS.items():
-        if raw.startswith(mark):
-            raise RecordingError(path, name, "UTF-8", "saving as UTF-8")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise RecordingError(
-            path,
-            f"byte 0x{raw[error.start]:02x}, which is not UTF-8",
-            "UTF-8",
-            "saving as UTF-8",
-            line=raw.count(b"\n", 0, error.start) + 1,
-        ) from None
-
-
-def _rows(lines: Lines, begin: int, end: int, width: int) -> Rows:
-    texts, numbers, cut = [], [], []
-    for i in range(begin, end):
-        row = lines.cells[i]
-        # Delimiters at the end of a row are no cells.
-        if len(row) < width or any(row[width:]):
-            if len(row) > width or i != len(lines.cells) - 1 or i == begin:
-                raise RecordingError(
-                    lines.path,
-                    f"{len(row)} cells",
-                    f"{width} as in the header",
-                    "completing the row or removing it",
-                    line=lines.numbers[i],
-                )
-            cut.append(lines.numbers[i])
-            continue
-        texts.append(lines.cells.texts[i])
-        numbers.append(lines.numbers[i])
-    if not texts:
-        raise RecordingError(
-            lines.path,
-            "0 samples",
-            "at least one",
-            "exporting the recording again",
-            line=lines.numbers[begin - 1],
-        )
-    cells = Cells(texts, lines.delimiter)
-    return Rows(lines.path, cells, np.array(numbers, np.intp), tuple(cut))
-
-
 def stripped(row: Sequence[str]) -> list[str]:
-    """A header's cells without blank ones at its end."""
-    row = list(row)
-    while row and not row[-1]:
-        row.pop()
-    return row
+    """Cells of a line, without spaces around them and without blank ones at the end."""
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
 
 
-def chosen_tool(lines: Lines, at: int, names: Sequence[str], tool: str | None) -> int:
-    """Which of the tools that line `at` of a file names is meant, the only one where none is asked for.
+def chosen_tool(export: Export, line: HeaderLine, names: Sequence[str], tool: str | None) -> int:
+    """Index of the tool with the name `tool`, or of the only one; raises an error that lists them.
 
-    Raises `RecordingError`, which lists them.
+    `line` is the header line that names the tools.
     """
-    told = ", ".join(names)
     if tool is None and len(names) == 1:
         return 0
-    found = [i for i, name in enumerate(names) if tool and name.lower() == tool.strip().lower()]
-    if len(found) == 1:
-        return found[0]
-    got = f"{len(names)} tools ({told})" if tool is None else f"no one tool '{tool}' among {told}"
+    matches = [i for i, name in enumerate(names) if tool and name.lower() == tool.strip().lower()]
+    if len(matches) == 1:
+        return matches[0]
+    listed = ", ".join(names)
+    got = (
+        f"{len(names)} tools ({listed})" if tool is None else f"no one tool '{tool}' among {listed}"
+    )
     if not names:
         got = "no tool with a rotation and a position"
-    raise RecordingError(
-        lines.path, got, "one tool", "naming it: --tool NAME, tool=NAME", line=lines.numbers[at]
-    )
+    raise export.error(line, got, "one tool", "naming it: --tool NAME, tool=NAME")
 
 
-class Timed(NamedTuple):
-    """Rows that have a stamp, and what became of the others."""
+class StampedRows(NamedTuple):
+    """Rows with a time stamp, and the account of the others."""
 
-    rows: Rows
+    table: Table
     time_ns: Times
     dropped: dict[str, Reason]
 
+    def floats(self, columns: Sequence[int], labels: Sequence[str]) -> Floats:
+        """Columns (N, len(columns)), NaN for blank cells; messages call them by their `labels`."""
+        return numbers(
+            self.table.named(dict(zip(columns, labels, strict=True))), labels, blank=True
+        )
 
-def timed(rows: Rows, time_ns: Times, known: Flags) -> Timed:
-    """Leave out rows without a stamp, and count those cut short. In an account, they have the stamp of the
-    row before. Raises `RecordingError` where no row has one."""
+
+def stamped_rows(table: Table, time_ns: Times, known: Flags) -> StampedRows:
+    """Leave out rows without a time stamp.
+
+    In the account they, and a truncated last line, have the stamp of the row before. Raises
+    `RecordingError` if no row has a stamp.
+    """
     if not known.any():
-        raise RecordingError(rows.path, "no row with a time", "one in each", "exporting again")
+        raise RecordingError(table.path, "no row with a time", "one in each", "exporting again")
     before = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
     dropped = {}
     if not known.all():
-        gone = np.flatnonzero(~known)
-        dropped["no time"] = Reason(rows.numbers[gone], time_ns[before[gone]])
-    if rows.cut:
-        stamp = np.full(len(rows.cut), time_ns[before[-1]])
-        dropped["cut short"] = Reason(np.array(rows.cut, np.intp), stamp)
-    return Timed(rows.take(known), time_ns[known], dropped)
+        missing = np.flatnonzero(~known)
+        dropped["no time"] = Reason(table.lines[missing], time_ns[before[missing]])
+    if table.text.cut:
+        stamp = np.full(len(table.text.cut), time_ns[before[-1]])
+        dropped["cut short"] = Reason(np.array(table.text.cut, np.intp), stamp)
+    return StampedRows(table.take(known), time_ns[known], dropped)
 
 
-def accounted(account: Intake, source: Timed, notes: Sequence[str] = ()) -> Intake:
-    """The account of a stream with the rows that had no part in it."""
+def accounted(account: Intake, source: StampedRows) -> Intake:
+    """The account of a stream, with the rows that were left out before it was made."""
     return replace(
         account,
         rows=account.rows + sum(reason.count for reason in source.dropped.values()),
         dropped={**account.dropped, **source.dropped},
-        notes=(*_delimiting(source.rows.cells), *notes, *account.notes),
+        notes=(*source.table.text.notes, *account.notes),
     )
 
 
-def _delimiting(cells: Cells) -> tuple[str, ...]:
-    if cells.delimiter == ",":
-        return ()
-    notes = [f"cells are separated by {_DELIMITERS[cells.delimiter]}s"]
-    with_comma = (i for i, text in enumerate(cells.texts) if "," in text)
-    if any("," in cell and _NUMBER.fullmatch(cell) for i in with_comma for cell in cells[i]):
-        notes.append("numbers have decimal commas")
-    return tuple(notes)
-
-
 def pose_stream(
-    source: Timed, quaternion: Floats, position: Floats, **said: Any
+    source: StampedRows, quaternion: Floats, position: Floats, **options: Any
 ) -> tuple[Optical, Intake]:
-    """A tracker's poses of an export as `intake.optical` judges them (w, x, y, z; metres).
+    """A tracker's poses and their account.
 
-    Numbers too large to be any are marks of a lost tool; so is the identity at the origin, which no tool
-    has by chance.
+    Numbers beyond `LARGEST` mark a lost tool. So does the identity at the origin.
+
+    Parameters
+    ----------
+    source : StampedRows
+        Rows of the poses.
+    quaternion : array (N, 4)
+        w, x, y, z; tool to reference.
+    position : array (N, 3)
+        Metres, in the reference frame.
+    **options
+        Options of `screening.optical`, such as ``status``, ``error`` and ``sort``.
     """
     with np.errstate(invalid="ignore"):
         marked = (np.abs(np.c_[quaternion, position]) > LARGEST).any(axis=1)
-        none = (np.abs(quaternion[:, 1:]) < 1e-9).all(axis=1) & (np.abs(position) < 1e-9).all(
-            axis=1
-        )
-    none &= np.abs(np.abs(quaternion[:, 0]) - 1.0) < 1e-9
-    also = {"no value (-3.7e28)": marked, "identity at the origin": none}
+        zero = (np.abs(np.c_[quaternion[:, 1:], position]) < 1e-9).all(axis=1)
+    zero &= np.abs(np.abs(quaternion[:, 0]) - 1.0) < 1e-9
+    also = {"no value (-3.7e28)": marked, "identity at the origin": zero}
     optical, account = screening.optical(
-        source.rows.place, source.time_ns, quaternion, position, also=also, **said
+        source.table.place, source.time_ns, quaternion, position, also=also, **options
     )
     return optical, accounted(account, source)
 
 
 def tracker_alone(
-    path: Path | str, otherwise: str, optical: Optical, account: Intake, info: dict[str, Any]
+    path: Path | str, default_name: str, optical: Optical, account: Intake, info: dict[str, Any]
 ) -> Recording:
-    """A run of a tracker without an IMU, named after its file, or `otherwise`."""
-    name = Path(path).name.split(".")[0] or otherwise
+    """A run of a tracker without an IMU, with the name of its file."""
+    name = Path(path).name.split(".")[0] or default_name
     return Recording(name, optical=optical, info=info, path=Path(path), intake={"optical": account})

@@ -1,4 +1,4 @@
-"""Messages of a bag's topics as streams: stamps, numbers and frames, judged by
+"""Messages of a bag's topics as streams: stamps, numbers and frames, screened by
 `jaxekf.recordings.screening`."""
 
 from array import array
@@ -24,12 +24,12 @@ POSE, POSE_COVARIANCE, TRANSFORM = (
 TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSES = (POSE, POSE_COVARIANCE, TRANSFORM)
 SET_CLOCK_NS = 10**18
-"""Times after this (September 2001) are those of a clock that was set; a stamp of 0 among them is none."""
+"""Later times (September 2001) are those of a clock that was set; a stamp of 0 among them is missing."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What streams are read from, and what is found out on the way."""
+    """An open bag with the options of the import, and the facts and assumptions collected on the way."""
 
     bag: Bag
     stamps: str
@@ -38,7 +38,7 @@ class Source:
     assumptions: list[str] = field(default_factory=list)
 
 
-class Rows:
+class TopicSamples:
     """Samples of a topic: times, numbers, and frames that may not change."""
 
     def __init__(
@@ -70,8 +70,8 @@ class Rows:
         self._times.append(received if self._receive else stamp.sec * NANOSECONDS + stamp.nanosec)
         self._values.extend(values)
 
-    def taken(self, width: int) -> tuple[Times, Floats]:
-        """Times (N,) and numbers (N, width); raises where there are none, or stamps were not set."""
+    def arrays(self, width: int) -> tuple[Times, Floats]:
+        """Times (N,) and numbers (N, width); raises without samples, or if stamps were not set."""
         if not self._times:
             raise self.place.error(None, None, "0 messages", "at least one", "recording again")
         time_ns = np.array(self._times, np.int64)
@@ -82,21 +82,21 @@ class Rows:
                 "header.stamp",
                 "stamps of 0 in every header" if unset.all() else "a stamp of 0",
                 "stamps that are set",
-                "stamps='receive' (--stamps receive) to take when the recorder got each message",
+                "stamps='receive' (--stamps receive) for the times of receipt by the recorder",
             )
         return time_ns, np.array(self._values, float).reshape(len(time_ns), width)
 
 
 def imu(source: Source, topic: Topic) -> tuple[Imu, Intake]:
     """Gyroscope and accelerometer of a topic of `IMU`."""
-    rows = Rows(source, topic)
+    rows = TopicSamples(source, topic)
     for received, message in source.bag.messages(topic):
         rate, force = message.angular_velocity, message.linear_acceleration
         known = message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0]
         rows.add(
             message.header, received, (rate.x, rate.y, rate.z, force.x, force.y, force.z, *known)
         )
-    time_ns, values = rows.taken(8)
+    time_ns, values = rows.arrays(8)
     rate, force, absent = values[:, :3], values[:, 3:6], values[:, 6:] == -1.0
     if absent[:, 0].all():
         raise rows.place.error(
@@ -112,30 +112,30 @@ def imu(source: Source, topic: Topic) -> tuple[Imu, Intake]:
     if absent[:, 1].all():
         force = None
         source.assumptions.append(
-            f"{name}the messages say that they hold no linear acceleration (covariance -1)"
+            f"{name}the messages state that they hold no linear acceleration (covariance -1)"
         )
     else:
         force[absent[:, 1]] = np.nan
-    _say_absent(source, topic, absent)
+    _assume_absent(source, topic, absent)
     source.assumptions.append(
-        f"{name}angular_velocity is rad/s and linear_acceleration m/s^2, gravity not taken off, in"
+        f"{name}angular_velocity is rad/s and linear_acceleration m/s^2, gravity included, in"
         f" '{rows.frame}'; orientation and covariances are not read"
     )
     return screening.imu(rows.place, time_ns, rate, force, sort=source.sort)
 
 
-def _say_absent(source: Source, topic: Topic, absent: Flags) -> None:
-    for column, what in enumerate(("angular velocity", "linear acceleration")):
+def _assume_absent(source: Source, topic: Topic, absent: Flags) -> None:
+    for column, quantity in enumerate(("angular velocity", "linear acceleration")):
         count = int(absent[:, column].sum())
         if 0 < count < len(absent):
             source.assumptions.append(
-                f"{topic.name}: {count} messages say that they hold no {what} (covariance -1) and are"
+                f"{topic.name}: {count} messages state that they hold no {quantity} (covariance -1) and are"
                 " left out"
             )
 
 
 def _poses(message: Any, kind: str) -> list[tuple[Any, str, Any, Any]]:
-    """Header, child frame ('' where there is none), position and quaternion of what a message holds."""
+    """Header, child frame ('' without one), position and quaternion of each pose in a message."""
     if kind == POSE:
         return [(message.header, "", message.pose.position, message.pose.orientation)]
     if kind == POSE_COVARIANCE:
@@ -149,7 +149,7 @@ def _poses(message: Any, kind: str) -> list[tuple[Any, str, Any, Any]]:
 
 def optical(source: Source, topic: Topic, child: str | None) -> tuple[Optical, Intake]:
     """Poses of a topic of `POSES` or `TREES`, of one child frame."""
-    rows = Rows(source, topic, child or "")
+    rows = TopicSamples(source, topic, child or "")
     frames: dict[str, None] = {}
     for received, message in source.bag.messages(topic):
         for header, name, p, q in _poses(message, topic.type):
@@ -167,7 +167,7 @@ def optical(source: Source, topic: Topic, child: str | None) -> tuple[Optical, I
             "one" if child is None else f"'{child}' among them",
             f"naming it (child_frame='{min(frames)}', --child-frame {min(frames)})",
         )
-    time_ns, values = rows.taken(7)
+    time_ns, values = rows.arrays(7)
     source.info["pose_frame"] = rows.frame
     if tracked := child or "".join(frames):
         source.info["pose_child_frame"] = tracked
@@ -191,7 +191,7 @@ def encoder(
             "its direction in the tracker's reference frame",
             "axis=[x, y, z] (--axis X Y Z)",
         )
-    rows = Rows(source, topic, name or "", one_frame=False)  # a joint is in none
+    rows = TopicSamples(source, topic, name or "", one_frame=False)  # a joint is in none
     joints: dict[str, None] = {}
     for received, message in bag.messages(topic):
         joints.update(dict.fromkeys(message.name))
@@ -209,7 +209,7 @@ def encoder(
             "one" if name is None else f"'{name}' among them",
             "naming one of them (joint_name=, --joint-name)",
         )
-    time_ns, values = rows.taken(1)
+    time_ns, values = rows.arrays(1)
     turned = name or next(iter(joints))
     source.info.update(joint=turned, joint_axis=axis.tolist())
     source.assumptions.append(

@@ -17,10 +17,24 @@ _G = 9.80665
 
 
 def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
-    """The log as a run of an IMU alone, in rad/s and m/s^2; its samples are evenly spaced.
+    """Read a log as a run of an IMU alone; `jaxekf allan` reads the folder that `jaxekf.save` writes of it.
 
-    `jaxekf.save` writes it as a folder, which `jaxekf allan` takes. Raises `RecordingError` where the file
-    is no such log.
+    Parameters
+    ----------
+    path : path
+        The NumPy file.
+    sampling_hz : float
+        Rate of the samples in Hz, which are evenly spaced.
+
+    Returns
+    -------
+    Recording
+        Times in ns; gyroscope (N, 3) in rad/s and accelerometer (N, 3) in m/s^2, in the IMU's frame.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not such a log.
     """
     file = Path(path)
     try:

@@ -19,8 +19,9 @@ from jaxekf.recordings.accounts import Place
 from jaxekf.recordings.types import NANOSECONDS, Optical, Recording, from_scipy, to_scipy
 
 _NEEDED = ("imu_gyr", "imu_acc", "opt_quat", "movement", "sampling_rate")
+_LISTED = 12
 _ASSUMPTIONS = (
-    "The body is the frame of the IMU; the markers' frame is taken to be the same (off by 0.1 to 0.5 deg).",
+    "The body is the frame of the IMU; the markers' frame is assumed the same (off by 0.1 to 0.5 deg).",
     "opt_quat is a unit quaternion w, x, y, z (Hamilton) that turns the body's coordinates into the"
     " reference's, which is east, north, up.",
     "The encoder is the optical attitude again: truth for a tracker made of it (broad.degrade),"
@@ -32,7 +33,7 @@ _ASSUMPTIONS = (
 
 
 def find(folder: Path | str, trial: int | str) -> Path:
-    """The file of a trial by its number, in a folder of BROAD ``.mat`` files (searched below it too)."""
+    """Find the file of a trial by its number, in a folder of BROAD ``.mat`` files or below it."""
     folder, number = Path(folder), int(trial)
     matches = sorted(folder.rglob(f"{number:02d}_*.mat"))
     if not matches:
@@ -46,10 +47,24 @@ def find(folder: Path | str, trial: int | str) -> Path:
 
 
 def load(path: Path | str) -> Recording:
-    """One trial: IMU, optical attitude and position, and the optical attitude again as truth.
+    """Read one trial: IMU, optical attitude and position, and the optical attitude again as truth.
 
-    Truth is valid where `opt_quat` is not NaN and scored where `movement` is set. `intake` holds the
-    account of every stream, by samples.
+    Parameters
+    ----------
+    path : path
+        The trial's MATLAB file.
+
+    Returns
+    -------
+    Recording
+        Times in ns, evenly spaced; attitude w, x, y, z, body to east, north, up; position in metres;
+        gyroscope in rad/s, accelerometer in m/s^2, magnetometer in µT. Truth is valid for samples with an
+        `opt_quat`, and scored for those with `movement`. `intake` accounts for every stream by sample.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a trial, or a folder, whose trials it lists.
     """
     path = Path(path)
     data = _read(path)
@@ -86,6 +101,15 @@ def load(path: Path | str) -> Recording:
 
 
 def _read(path: Path) -> Mapping[str, Any]:
+    if path.is_dir():
+        names = sorted(file.name for file in path.rglob("*.mat"))
+        more = ", ..." if len(names) > _LISTED else ""
+        raise RecordingError(
+            path,
+            f"a folder that holds {len(names)} trials ({', '.join(names[:_LISTED])}{more})",
+            "one BROAD .mat file",
+            "naming it",
+        )
     if not path.is_file():
         raise RecordingError(path, "no such file", "a BROAD .mat file", "another path")
     try:
@@ -113,12 +137,29 @@ def degrade(
     mean_interval_s: float = 6.0,
     lead_s: float = 5.0,
 ) -> Recording:
-    """The optical tracker made from a trial: decimated, noisy, and hidden now and then.
+    """Make an optical tracker from a trial: decimated, noisy, with occlusions.
 
-    Starts `lead_s` before the first scored sample; keeps every `keep_every`-th sample;
-    right-multiplies by ``exp`` of white noise of `noise_deg` per axis; hides the tracker for a uniform
-    time in `gap_s` at exponential intervals of `mean_interval_s`, counted from the end of the gap
-    before. The first sample is visible. Random numbers from ``numpy.random.default_rng([seed, trial])``.
+    Parameters
+    ----------
+    recording : Recording
+        A trial as `load` reads it.
+    seed, trial : int
+        Random numbers are from ``numpy.random.default_rng([seed, trial])``.
+    keep_every : int
+        Every `keep_every`-th sample is kept; the first one is visible.
+    noise_deg : float
+        White noise per axis, deg, whose ``exp`` multiplies the attitude from the right.
+    gap_s : (float, float)
+        Bounds of the uniform duration of an occlusion, s.
+    mean_interval_s : float
+        Mean of the exponential time from the end of an occlusion to the next, s.
+    lead_s : float
+        Time before the first scored sample at which the recording begins, s.
+
+    Returns
+    -------
+    Recording
+        The trial with this tracker, and the IMU from its first sample on.
     """
     rng = np.random.default_rng([seed, trial])
     encoder, optical, imu = recording.need_encoder(), recording.need_optical(), recording.need_imu()
@@ -151,7 +192,7 @@ def degrade(
 def _gaps(
     rng: np.random.Generator, time_ns: Any, gap_s: tuple[float, float], mean_interval_s: float
 ) -> Any:
-    """Which samples fall into a gap."""
+    """A mask (N,) of the samples within an occlusion."""
     elapsed = (time_ns - time_ns[0]) / NANOSECONDS
     hidden = np.zeros(len(elapsed), bool)
     start = rng.exponential(mean_interval_s)

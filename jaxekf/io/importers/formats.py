@@ -1,115 +1,165 @@
-"""Files of other programs and published data sets, by the name of their format."""
+"""Files of other programs and published data sets, by the name of their format.
+
+A new importer is a module with a function `load` and an entry in `FORMATS`, from which the command
+`jaxekf import` gets its options. Importers are imported when they are first used.
+"""
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io.importers import adis, asl, broad, ndi, optitrack, repoimu, vicon
-from jaxekf.recordings.types import Recording
 
-_SHOWN = 12
+if TYPE_CHECKING:
+    from jaxekf.recordings.types import Recording
+
+
+class Option(NamedTuple):
+    """A keyword of an importer's `load`, and its option of the command line."""
+
+    name: str
+    """The keyword; the option has its name without the unit: ``rate_hz`` is ``--rate``."""
+    help: str
+    """A noun phrase."""
+    kind: type = str
+    """`str`, `float`, or `bool` for a flag."""
+    unit: str = ""
+    """Suffix of the name, such as ``hz``."""
+    default: str | float | None = None
+    """Default of the importer, for the help text."""
+    choices: tuple[str, ...] = ()
+    bounds: tuple[float, float] | None = None
+    """Largest number, and the number that it must exceed."""
+    values: tuple[str, ...] = ()
+    """Names of its values, if there are several."""
+    repeatable: bool = False
+
+    @property
+    def flag(self) -> str:
+        """Name on the command line."""
+        return "--" + self.name.removesuffix(f"_{self.unit}").replace("_", "-")
 
 
 class Format(NamedTuple):
-    """How files of one kind are read."""
+    """An importer."""
 
-    load: Callable[..., Recording]
-    """Takes a path, and the options below by name."""
-    about: str
-    options: tuple[str, ...] = ()
-    """What `load` may be told besides the path."""
+    module: str
+    """Its module in this package."""
+    summary: str
+    options: tuple[Option, ...] = ()
 
-
-def _one_asl(path: Path | str, **options: Any) -> Recording:
-    """One recording; a folder of several is refused by their names."""
-    place = Path(path)
-    if place.is_dir():
-        found = asl.find(place)
-        if len(found) > 1 and place not in found:
-            told = [one.relative_to(place).as_posix() for one in found]
-            more = ", ..." if len(told) > _SHOWN else ""
-            raise RecordingError(
-                place,
-                f"{len(told)} recordings ({', '.join(told[:_SHOWN])}{more})",
-                "one",
-                f"naming it: {place / told[0]}",
-            )
-        # Where it stands deeper, it is still the only one that can be meant.
-        place = found[0] if len(found) == 1 else place
-    return asl.load(place, **options)
+    @property
+    def load(self) -> "Callable[..., Recording]":
+        """Its function, which takes a path, and its options by name."""
+        return import_module(f"{__package__}.{self.module}").load
 
 
-def _one_trial(path: Path | str) -> Recording:
-    """One trial of BROAD; a folder of several is refused by their names."""
-    place = Path(path)
-    if place.is_dir():
-        told = sorted(file.name for file in place.rglob("*.mat"))
-        more = ", ..." if len(told) > _SHOWN else ""
-        raise RecordingError(
-            place,
-            f"a folder that holds {len(told)} trials ({', '.join(told[:_SHOWN])}{more})",
-            "one BROAD .mat file",
-            "naming it",
-        )
-    return broad.load(place)
-
-
-def _bag(path: Path | str, **options: Any) -> Recording:
-    """A ROS bag; its readers are loaded only when there is one."""
-    from jaxekf.io.importers import ros
-
-    return ros.load(path, **options)
-
+_TOOL = Option("tool", "name of the tool, rigid body, segment or object, if SRC holds several")
+_SORT = Option("sort", "sort rows or messages by time that are out of order", bool)
 
 FORMATS: Mapping[str, Format] = {
     "ndi": Format(
-        ndi.load,
+        "ndi",
         "NDI tracker, CSV export (tool by --tool): a tracker alone",
-        ("tool", "rate_hz", "status_ok", "sort"),
+        (
+            _TOOL,
+            Option(
+                "rate_hz",
+                "rate of the frame numbers in Hz, for files without time stamps",
+                float,
+                unit="hz",
+                default=60,
+                bounds=(0.0, 1e6),
+            ),
+            Option(
+                "status_ok",
+                "state of a good pose, a word or a number, instead of the usual ones",
+                repeatable=True,
+            ),
+            _SORT,
+        ),
     ),
     "optitrack": Format(
-        optitrack.load,
+        "optitrack",
         "OptiTrack Motive, CSV export of rigid bodies: a tracker alone",
-        ("tool", "sort"),
+        (_TOOL, _SORT),
     ),
     "vicon": Format(
-        vicon.load,
+        "vicon",
         "Vicon Nexus or Tracker, CSV export of segments or objects: a tracker alone",
-        ("tool", "sort"),
+        (_TOOL, _SORT),
     ),
     "asl": Format(
-        _one_asl, "EuRoC, TUM-VI and others in the ASL layout: tracker and IMU", ("imu", "pose")
+        "asl",
+        "EuRoC, TUM-VI and others in the ASL layout: tracker and IMU",
+        (
+            Option("imu", "stream of the IMU, by name or path"),
+            Option("pose", "stream of the poses, by name or path"),
+        ),
     ),
     "ros": Format(
-        _bag,
+        "ros",
         "ROS 1 bag, ROS 2 bag, .mcap or .db3: tracker, IMU and a joint's angle",
-        ("imu", "pose", "child_frame", "joint", "joint_name", "axis", "stamps", "sort"),
+        (
+            Option("imu", "topic of the IMU"),
+            Option("pose", "topic of the poses"),
+            Option("child_frame", "frame of the poses, if a topic has several"),
+            Option("joint", "topic of the joint's angle, for truth; needs --axis"),
+            Option("joint_name", "name of the joint, if a topic has several"),
+            Option(
+                "axis", "the joint's axis in the tracker's frame", float, values=("X", "Y", "Z")
+            ),
+            Option(
+                "stamps",
+                "stamps of the headers, or of receipt by the recorder",
+                default="header",
+                choices=("header", "receive"),
+            ),
+            _SORT,
+        ),
     ),
-    "broad": Format(_one_trial, "BROAD trial (.mat): tracker, IMU and truth"),
-    "repoimu": Format(repoimu.load, "RepoIMU T-stick trial (.csv, .csv.gz): tracker and IMU"),
-    "adis": Format(adis.load, "static log of the R package imudata (.npz): an IMU alone"),
+    "broad": Format("broad", "BROAD trial (.mat): tracker, IMU and truth"),
+    "repoimu": Format("repoimu", "RepoIMU T-stick trial (.csv, .csv.gz): tracker and IMU"),
+    "adis": Format("adis", "static log of the R package imudata (.npz): an IMU alone"),
 }
 """Formats by name."""
 
 
-def read(name: str, path: Path | str, **options: Any) -> Recording:
-    """A recording of a format, its origin and the account of its rows in ``info["imported"]``.
+def read(name: str, path: Path | str, **options: Any) -> "Recording":
+    """Read a recording of any format.
 
-    Raises `RecordingError` for a format that is not known, and what its loader raises.
+    Parameters
+    ----------
+    name : str
+        A key of `FORMATS`.
+    path : path
+        The file or folder.
+    **options
+        Options of the format.
+
+    Returns
+    -------
+    Recording
+        The recording, with its source, options and the account of its rows in ``info["imported"]``.
+
+    Raises
+    ------
+    RecordingError
+        For an unknown format, and as the importer does.
     """
     if name not in FORMATS:
         raise RecordingError(
             path, f"the format '{name}'", f"one of {', '.join(FORMATS)}", "one of these"
         )
     recording = FORMATS[name].load(path, **options)
-    told = {
-        key: list(value) if isinstance(value, tuple) else value for key, value in options.items()
-    }
     imported = {
         "format": name,
         "source": Path(path).name,
-        **told,
+        **{
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in options.items()
+        },
         "account": {label: account.as_dict() for label, account in recording.intake.items()},
     }
     return recording.replace(info={**recording.info, "imported": imported})

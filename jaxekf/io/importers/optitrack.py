@@ -1,29 +1,28 @@
 """Importer of rigid bodies from CSV exports of OptiTrack's Motive (format versions 1.1 to 1.25).
 
-The first line holds keys and values; then a header over several lines says of every column what it is of
-(type, name, identity) and what it holds (rotation or position, and the axis); then the samples.
+The first line holds keys and values. A header of several lines then gives for each column the type, name
+and identity of its object, the quantity (rotation or position) and the axis. The samples follow.
 """
 
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf._support.errors import RecordingError
+from jaxekf.io.csv_table import times_or_blank
 from jaxekf.io.importers._exports import (
     METRES,
-    Lines,
+    Export,
+    HeaderLine,
     chosen_tool,
     pose_stream,
-    read_lines,
-    stripped,
-    timed,
+    read_export,
+    stamped_rows,
     tracker_alone,
 )
 from jaxekf.recordings.types import NANOSECONDS, Recording
 
-_WHAT = "a CSV export of Motive with rigid bodies"
+_EXPECTED = "a CSV export of Motive with rigid bodies"
 _BODY = "rigid body"
 _COLUMNS = (
     *("rotation x", "rotation y", "rotation z", "rotation w"),
@@ -32,42 +31,59 @@ _COLUMNS = (
 
 
 class _Header(NamedTuple):
-    """What the lines above the samples say of every column."""
+    """The lines above the samples."""
 
-    axes: int
-    """The line just above the samples."""
-    types: int
-    width: int
-    parts: list[str]
-    """Such as ``rotation x`` or ``mean marker error``, in lower case."""
+    types: HeaderLine
+    names: HeaderLine
+    axes: HeaderLine
+    """The last line of the header."""
+    quantities: list[str]
+    """Content of each column in lower case, such as ``rotation x`` or ``mean marker error``."""
 
 
 def load(path: Path | str, *, tool: str | None = None, sort: bool = False) -> Recording:
-    """The poses of one rigid body, as a run of a tracker alone.
+    """Read the poses of one rigid body, as a run of a tracker alone.
 
-    `tool` is its name; it may be left out where there is only one. Times are those of the column
-    ``Time (Seconds)``, exactly. Blank cells are occlusions. The mean marker error, where it was exported,
-    is the reported fit error. With `sort` rows that are out of order are put in order of time. Raises
-    `RecordingError`, which names file, line and column, also for rotations that are not quaternions, units
-    of length that are not metric, and poses that are not global.
+    Blank cells are occlusions. The mean marker error, if it was exported, is the reported fit error.
+
+    Parameters
+    ----------
+    path : path
+        A CSV export of Motive.
+    tool : str, optional
+        Name of the rigid body; needed if there are several.
+    sort : bool
+        Sort rows by time that are out of order.
+
+    Returns
+    -------
+    Recording
+        Times in ns, exact, from the column ``Time (Seconds)``; attitude w, x, y, z, body to Motive's global
+        frame; position and error in metres.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not such an export, also for rotations that are not quaternions, units of length that
+        are not metric and poses that are not global; names file, line and column.
     """
-    lines = read_lines(path, _WHAT)
-    facts = _facts(lines)
-    metres = _check(lines, facts)
-    header = _header(lines)
-    names, groups = _bodies(lines, header)
-    at = chosen_tool(lines, header.types + 1, names, tool)
+    export = read_export(path, _EXPECTED)
+    facts = _facts(export)
+    metres = _check(export, facts)
+    header = _header(export)
+    names, groups = _bodies(export, header)
+    at = chosen_tool(export, header.names, names, tool)
     group = groups[at]
-    rows = lines.body(header.axes, header.width)
-    time = next(i for i, cell in enumerate(lines.cells[header.axes]) if cell.lower()[:4] == "time")
-    source = timed(rows, *rows.times(time, "Time", Decimal(NANOSECONDS)))
-    values = source.rows.floats([group[n] for n in _COLUMNS], [n.title() for n in _COLUMNS])
-    error = next((i for part, i in group.items() if "error" in part), None)
-    said: dict[str, Any] = {}
+    time = next(i for i, cell in enumerate(header.axes.cells) if cell.lower()[:4] == "time")
+    table = export.table(header.axes, len(header.quantities)).named({time: "Time"})
+    source = stamped_rows(table, *times_or_blank(table, "Time", NANOSECONDS))
+    values = source.floats([group[n] for n in _COLUMNS], [n.title() for n in _COLUMNS])
+    error = next((i for quantity, i in group.items() if "error" in quantity), None)
+    options: dict[str, Any] = {}
     if error is not None:
-        said["error"] = metres * source.rows.floats([error], ["Mean Marker Error"])[:, 0]
+        options["error"] = metres * source.floats([error], ["Mean Marker Error"])[:, 0]
     optical, account = pose_stream(
-        source, np.roll(values[:, :4], 1, axis=1), metres * values[:, 4:], sort=sort, **said
+        source, np.roll(values[:, :4], 1, axis=1), metres * values[:, 4:], sort=sort, **options
     )
     rate = facts.get("export frame rate", facts.get("capture frame rate", ""))
     info: dict[str, Any] = {
@@ -79,10 +95,13 @@ def load(path: Path | str, *, tool: str | None = None, sort: bool = False) -> Re
             "Rotations are unit quaternions x, y, z, w (Hamilton) that turn the rigid body's coordinates"
             " into the global ones.",
             f"Positions and marker errors are in units of {metres:g} m"
-            + (", as the first line says." if "length units" in facts else ": no unit is stated."),
+            + (
+                ", as the first line states." if "length units" in facts else ": no unit is stated."
+            ),
             "Times are seconds since the capture began, on the tracker's own clock; a pose was taken at"
             " its stamp.",
-            "Which way is up is not in the file (Motive's default is y): gravity_ref is not set.",
+            "The file does not state the direction of gravity (Motive's default is -y): gravity_ref is not"
+            " set.",
         ],
     }
     if "capture start time" in facts:
@@ -92,83 +111,76 @@ def load(path: Path | str, *, tool: str | None = None, sort: bool = False) -> Re
     return tracker_alone(path, "motive", optical, account, info)
 
 
-def _facts(lines: Lines) -> dict[str, str]:
+def _facts(export: Export) -> dict[str, str]:
     """Keys, in lower case, and values of the first line."""
-    first = lines.cells[0]
-    if first[0].lower() != "format version":
-        raise RecordingError(
-            lines.path,
-            f"a file that begins with '{first[0]}'",
+    first = export.head[0]
+    if first.cells[0].lower() != "format version":
+        raise export.error(
+            first,
+            f"a file that begins with '{first.cells[0]}'",
             "Format Version, the first line of an export of Motive",
             "exporting with header information",
-            line=lines.numbers[0],
         )
-    return {key.lower(): value for key, value in zip(first[::2], first[1::2], strict=False)}
+    return {
+        key.lower(): value for key, value in zip(first.cells[::2], first.cells[1::2], strict=False)
+    }
 
 
-def _check(lines: Lines, facts: dict[str, str]) -> float:
-    """Metres in a unit of the file; raise where rotations, units or space are others than are read."""
+def _check(export: Export, facts: dict[str, str]) -> float:
+    """Metres in a unit of the file; raises for rotations, units or frames that are not supported."""
     unit = facts.get("length units", "meters")
-    wanted = {
+    supported = {
         "rotation type": (facts.get("rotation type", "Quaternion"), ("quaternion",)),
         "length units": (unit, tuple(unit for unit in METRES if len(unit) > 2)),
         "coordinate space": (facts.get("coordinate space", "Global"), ("global",)),
     }
-    for key, (value, known) in wanted.items():
+    for key, (value, known) in supported.items():
         if value.lower() not in known:
-            raise RecordingError(
-                lines.path,
+            raise export.error(
+                export.head[0],
                 f"{key.title()} {value}",
                 " or ".join(word.title() for word in known),
                 "exporting with that setting",
-                line=lines.numbers[0],
-                column=key.title(),
+                key.title(),
             )
     return METRES[unit.lower()]
 
 
-def _header(lines: Lines) -> _Header:
-    axes = next((i for i, row in enumerate(lines.cells[:20]) if row[0].lower() == "frame"), None)
+def _header(export: Export) -> _Header:
+    head = export.head[:20]
+    axes = next((i for i, line in enumerate(head) if line.cells[0].lower() == "frame"), None)
     types = next(
-        (i for i, row in enumerate(lines.cells[:20]) if _BODY in {cell.lower() for cell in row}),
-        None,
+        (i for i, line in enumerate(head) if _BODY in {cell.lower() for cell in line.cells}), None
     )
     if axes is None or types is None or types + 2 > axes - 1 or axes < 4:
-        raise RecordingError(
-            lines.path,
+        raise export.error(
+            head[0],
             "no column of the type Rigid Body above a line Frame,Time (Seconds)",
-            _WHAT,
+            _EXPECTED,
             "exporting rigid bodies with header information",
-            line=lines.numbers[0],
         )
-    if not any(cell.lower()[:4] == "time" for cell in lines.cells[axes]):
-        raise RecordingError(
-            lines.path, "no column Time (Seconds)", "one", "exporting again",
-            line=lines.numbers[axes],
-        )  # fmt: skip
-    width = max(len(stripped(row)) for row in lines.cells[types : axes + 1])
-    whole = [row + [""] * width for row in (lines.cells[axes - 1], lines.cells[axes])]
-    parts = [f"{whole[0][i]} {whole[1][i]}".strip().lower() for i in range(width)]
-    return _Header(axes, types, width, parts)
+    if not any(cell.lower()[:4] == "time" for cell in head[axes].cells):
+        raise export.error(head[axes], "no column Time (Seconds)", "one", "exporting again")
+    width = max(len(line.cells) for line in head[types : axes + 1])
+    quantities = [
+        f"{head[axes - 1].cell(i)} {head[axes].cell(i)}".strip().lower() for i in range(width)
+    ]
+    return _Header(head[types], head[types + 1], head[axes], quantities)
 
 
-def _bodies(lines: Lines, header: _Header) -> tuple[list[str], list[dict[str, int]]]:
-    """Names of the rigid bodies with a rotation and a position, and their columns by what they hold."""
-    kinds, titles = (
-        row + [""] * header.width for row in lines.cells[header.types : header.types + 2]
-    )
+def _bodies(export: Export, header: _Header) -> tuple[list[str], list[dict[str, int]]]:
+    """Names of the rigid bodies with a rotation and a position, and the columns of their quantities."""
     found: dict[str, dict[str, int]] = {}
-    for i in range(header.width):
-        if kinds[i].lower() == _BODY and titles[i]:
-            found.setdefault(titles[i], {})[header.parts[i]] = i
+    for i, quantity in enumerate(header.quantities):
+        if header.types.cell(i).lower() == _BODY and header.names.cell(i):
+            found.setdefault(header.names.cell(i), {})[quantity] = i
     whole = {name: group for name, group in found.items() if set(_COLUMNS) <= set(group)}
     if found and not whole:
         lacking = sorted(set(_COLUMNS) - set(next(iter(found.values()))))
-        raise RecordingError(
-            lines.path,
+        raise export.error(
+            header.axes,
             f"a rigid body without {', '.join(lacking)}",
             "rotation X, Y, Z, W and position X, Y, Z",
             "exporting both, rotations as quaternions",
-            line=lines.numbers[header.axes],
         )
     return list(whole), list(whole.values())

@@ -37,24 +37,41 @@ def load(
     stamps: str = "header",
     sort: bool = False,
 ) -> Recording:
-    """One recording of a bag: a ``.bag`` of ROS 1, the folder of a ROS 2 bag, an ``.mcap`` or a ``.db3``.
+    """Read one recording of a bag.
 
-    `imu`, `pose` and `joint` are topics; None finds the only one of a suitable type, and a stream of which
-    there is none is left out. `child_frame` chooses one of several transforms on a topic; a transform tree
-    (``/tf``) is read only where it or the topic is given. Of a joint's angle the attitude is
-    ``exp(axis angle)`` in the tracker's reference frame, so `axis` (3,) is needed: without it, and without
-    `joint` or `joint_name` (one of several joints), joint angles are left out.
+    Parameters
+    ----------
+    path : path
+        A ``.bag`` of ROS 1, the folder of a ROS 2 bag, an ``.mcap`` or a ``.db3``.
+    imu, pose, joint : str, optional
+        Topics. The only topic of a suitable type is the default; without one, the stream is left out. A
+        transform tree (``/tf``) is read only if it or `child_frame` is given, joint angles only if `joint`,
+        `joint_name` or `axis` is given.
+    child_frame : str, optional
+        One of several transforms on a topic.
+    joint_name : str, optional
+        One of several joints on a topic.
+    axis : array (3,), optional
+        Axis of the joint in the tracker's reference frame, needed for joint angles: their attitude is
+        ``exp(axis angle)``.
+    stamps : {"header", "receive"}
+        Stamps of the headers, or times at which the recorder received the messages.
+    sort : bool
+        Sort messages by time that are out of order.
 
-    Times are the headers' stamps, exact; `stamps` "receive" takes when the recorder got a message
-    instead. `sort` puts messages in order that are not. Rates are rad/s, specific forces m/s^2, positions
-    m, as the messages' definitions say; quaternions x, y, z, w become w, x, y, z, body to reference: the
-    pose of the tracked frame in ``header.frame_id``. A covariance that begins with -1 says that the
-    field is not there.
+    Returns
+    -------
+    Recording
+        Times in ns, exact; rates in rad/s, specific forces in m/s^2, positions in m, as the messages'
+        definitions state; attitude w, x, y, z, tracked frame to ``header.frame_id``. A field whose
+        covariance begins with -1 is absent. `info` holds the topics and frames, and in sentences all
+        ``assumptions``; `intake` accounts for every message, counted from 0.
 
-    `info` holds the topics and frames, and in sentences all ``assumptions``; `Recording.intake` what
-    became of every message (samples are counted from 0). Raises `RecordingError`: for a file that cannot
-    be read, topics that are missing or not the only ones, stamps that are not set or run backwards, frames
-    that change, and what `jaxekf.recordings.screening` finds.
+    Raises
+    ------
+    RecordingError
+        For a bag that cannot be read, missing or several suitable topics, stamps that are not set or
+        decrease, frames that change, and as `jaxekf.recordings.screening` does.
     """
     path = Path(path)
     if stamps not in STAMPS:
@@ -65,7 +82,7 @@ def load(
     with opened(path) as bag:
         source = Source(bag, stamps, sort)
         topics = _choose(source, imu, pose, child_frame, joint, joint_name, turning)
-        _say_times(source)
+        _assume_times(source)
         if (topic := topics["imu"]) is not None:
             streams["imu"], accounts["imu"] = ros_messages.imu(source, topic)
         if (topic := topics["pose"]) is not None:
@@ -76,7 +93,7 @@ def load(
             streams["encoder"], accounts["encoder"] = ros_messages.encoder(
                 source, topic, joint_name, turning
             )
-    _say_body(source)
+    _assume_body(source)
     return Recording(
         _name(path),
         **streams,
@@ -87,7 +104,7 @@ def load(
 
 
 # ---------------------------------------------------------------------------------------------
-# Which topics
+# Topics
 
 
 def _choose(
@@ -99,7 +116,7 @@ def _choose(
     joint_name: str | None,
     axis: Floats | None,
 ) -> Mapping[str, Topic | None]:
-    """The topic of each stream, None where there is none; raises where it is not clear which."""
+    """The topic of each stream, None without one; raises if several are suitable."""
     bag = source.bag
     wants_joint = joint is not None or joint_name is not None or axis is not None
     poses = POSES if pose is None else (*POSES, *TREES)
@@ -156,10 +173,10 @@ def _topic(bag: Bag, label: str, types: Sequence[str], name: str | None) -> Topi
         # Static transforms are no recording of motion.
         found = [t for t in bag.topics if t.type in types and t.stated and t.name != "/tf_static"]
     if len(found) > 1:
-        told = ", ".join(f"{t.name} ({t.type}, {t.stated})" for t in found)
+        listed = ", ".join(f"{t.name} ({t.type}, {t.stated})" for t in found)
         raise RecordingError(
             bag.path,
-            f"{len(found)} topics for {label}: {told}",
+            f"{len(found)} topics for {label}: {listed}",
             "one",
             f"naming it ({label}='{found[0].name}', --{label} {found[0].name})",
         )
@@ -167,8 +184,7 @@ def _topic(bag: Bag, label: str, types: Sequence[str], name: str | None) -> Topi
 
 
 def _listed(bag: Bag) -> str:
-    told = ", ".join(f"{t.name} ({t.type}, {t.stated})" for t in bag.topics)
-    return told or "none"
+    return ", ".join(f"{t.name} ({t.type}, {t.stated})" for t in bag.topics) or "none"
 
 
 def _axis(path: Path, axis: Sequence[float]) -> Floats:
@@ -183,28 +199,26 @@ def _axis(path: Path, axis: Sequence[float]) -> Floats:
     return direction
 
 
-def _say_times(source: Source) -> None:
-    header = "times are the headers' stamps, taken as when each sample was measured"
-    receive = (
-        "times are when the recorder got each message, which is later than when it was measured"
-    )
+def _assume_times(source: Source) -> None:
+    header = "times are the headers' stamps, assumed to be the times of measurement"
+    receive = "times are those of receipt by the recorder, which are later than the measurements"
     source.assumptions.append(header if source.stamps == "header" else receive)
     if source.sort:
-        source.assumptions.append("messages are put in the order of their times")
+        source.assumptions.append("messages are sorted by time")
 
 
-def _say_body(source: Source) -> None:
-    """Nothing in a bag says how the tracked frame lies in the IMU's."""
+def _assume_body(source: Source) -> None:
+    """A bag does not state the rotation between tracked frame and IMU."""
     info = source.info
     if "imu_topic" in info and "pose_topic" in info:
         body = info.get("pose_child_frame") or f"of {info['pose_topic']}"
         source.assumptions.append(
-            f"the tracked frame ({body}) is taken for the IMU's ({info['imu_frame'] or 'unnamed'}); how it"
-            " lies in it is not in the bag: `jaxekf align` finds it"
+            f"the tracked frame ({body}) is assumed to be the IMU's ({info['imu_frame'] or 'unnamed'});"
+            " the bag does not state the rotation between them: `jaxekf align` finds it"
         )
 
 
 def _name(path: Path) -> str:
-    """A recording's name by its file or folder."""
+    """The name of a recording's file or folder."""
     path = Path(os.path.abspath(path))  # not resolved: a link's name is the one that was given
     return (path.name if path.is_dir() else path.stem) or "recording"

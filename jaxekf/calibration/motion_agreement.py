@@ -200,7 +200,7 @@ def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
     """Lag, s, at which the rotation angles correlate best, independent of frames and units."""
     few = slice(None, None, max(1, -(-len(size) // _SEARCHED)))
     begin, end = begin[few], end[few]
-    # Two bounds on wrong poses, which would dominate the correlation: motion in few pairs exceeds the lower.
+    # Wrong poses would dominate the correlation. The larger bound keeps motion that fills few pairs only.
     sizes = np.stack([np.minimum(size[few], np.quantile(size, most)) for most in (0.9, 0.98)])
     room = min(LARGEST_LAG_S, 0.1 * float(integral.t[-1]))
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import jaxekf
 from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.calibration import time_offset
-from jaxekf.calibration.alignment import align, align_run, calibration_for, poses, combine_runs
+from jaxekf.calibration.alignment import align, align_run, calibration_for, combine_runs, poses
 from jaxekf.calibration.attitude_alignment import refine
 from jaxekf.cli import main
 from jaxekf.estimation import parameters

@@ -200,7 +200,7 @@ def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
     """Lag, s, at which the rotation angles correlate best, independent of frames and units."""
     few = slice(None, None, max(1, -(-len(size) // _SEARCHED)))
     begin, end = begin[few], end[few]
-    # Wrong poses would outweigh all motion; where there is little of it, it is not to be cut short itself.
+    # Wrong poses would dominate the correlation. The larger bound keeps motion that fills few pairs only.
     sizes = np.stack([np.minimum(size[few], np.quantile(size, most)) for most in (0.9, 0.98)])
     room = min(LARGEST_LAG_S, 0.1 * float(integral.t[-1]))
 
@@ -365,7 +365,7 @@ def mean_force(rotations: RelativeRotations, imu: Imu, frame: Floats) -> Floats:
 
 def _fit_accelerations(acceleration: Floats, force: Floats) -> AccelerationFit:
     one, other = acceleration - np.median(acceleration, axis=0), force - np.median(force, axis=0)
-    # Wrong poses leave huge differences.
+    # Wrong poses cause large differences.
     size = np.linalg.norm(one, axis=1)
     kept = size <= np.quantile(size, 1.0 - _OUTLIER_SHARE)
     one, other = one[kept] - one[kept].mean(axis=0), other[kept] - other[kept].mean(axis=0)

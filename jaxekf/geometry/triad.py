@@ -151,7 +151,7 @@ def triad_covariance(
         For a covariance of another shape.
     """
     for cov in (first_cov, second_cov):
-        # Anything else would be broadcast, to what is no covariance.
+        # Any other shape would be broadcast, to a result that is no covariance.
         if jnp.shape(cov) != (3, 3):
             raise ValueError(
                 f"got a covariance of shape {jnp.shape(cov)}, expected (3, 3); of a standard deviation it"

@@ -66,7 +66,7 @@ def camera(count: int, bilinear: bool, recording: Recording) -> Samples:
     """Image points (N, 2 count) of the first `count` visible landmarks; zeros in the bilinear form."""
     stream = recording.need_camera()
     usable = stream.usable
-    # The landmarks that are seen, in order, then others to fill up.
+    # Visible landmarks in order, then others as padding.
     order = np.argsort(~usable, axis=1, kind="stable")[:, :count]
     here = np.arange(len(stream.time_ns))[:, None]
     mask = usable[here, order]

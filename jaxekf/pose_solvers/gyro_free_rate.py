@@ -31,7 +31,7 @@ from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray, Differen
 _DECIDED = 9.0
 # Closer than this, relative, it is the same solution.
 _SAME = 1e-5
-# A solution is meant if it is at most this many times as far from the rate before as the nearest one.
+# A solution is plausible if it is at most this many times as far from the previous rate as the nearest.
 _AS_FAR = 10.0
 
 
@@ -137,10 +137,10 @@ def _has_second_solution(
         costs = jax.vmap(lambda other: jnp.sum(problem.residual(other) ** 2))(others)
         apart = jnp.max(jnp.abs(others - rate[None]), axis=1)
         elsewhere = apart > _SAME * (1.0 + jnp.max(jnp.abs(rate)))
-        gone = jnp.sqrt(jnp.sum((others - before[None]) ** 2, axis=1))
-        # The first search may end anywhere, the second only at a rate that may be meant.
-        meant = jnp.stack([jnp.asarray(True), gone[1] <= _AS_FAR * moved])
-        return jnp.any(found & elsewhere & meant & (costs <= cost + _DECIDED))
+        distance = jnp.sqrt(jnp.sum((others - before[None]) ** 2, axis=1))
+        # The first search may end anywhere, the second only at a plausible rate.
+        plausible = jnp.stack([jnp.asarray(True), distance[1] <= _AS_FAR * moved])
+        return jnp.any(found & elsewhere & plausible & (costs <= cost + _DECIDED))
 
     return lax.cond(regular, lambda: jnp.asarray(False), search)
 

@@ -82,7 +82,7 @@ def poses(camera: Camera, most: int | None = None) -> Resection:
     if key not in _CACHE:
         shown = np.arange(len(camera.time_ns)) % every == 0
         found = _poses(replace(camera, visible=camera.visible & shown[:, None]))
-        # An id may be another camera's once this one is gone.
+        # The id of a deleted camera may be reused.
         _CACHE[key] = weakref.ref(camera, lambda _: _CACHE.pop(key, None)), found
     return _CACHE[key][1]
 
@@ -322,7 +322,7 @@ def _null_vector(matrix: Floats) -> Floats:
     return np.linalg.eigh(matrix.T @ matrix)[1][:, 0]
 
 
-# --- Gauss and Newton ---------------------------------------------------------------------------------
+# --- Gauss-Newton --------------------------------------------------------------------------------------
 
 
 def _linearise(points: _Points, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:

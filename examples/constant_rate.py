@@ -139,7 +139,7 @@ def main() -> None:
     if arguments.output is not None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         estimate = jaxekf.estimate(records[0], "loose", parameters("loose"))
-        for name in plots.possible_figures(estimate, records[0]):
+        for name in plots.available_figures(estimate, records[0]):
             figure = plots.figure_functions()[name](estimate, records[0])
             plots.save(figure, arguments.output / f"{name}.png")
     summary = {"measurement_deg": raw[0], "measurement_deg_s": raw[1], **table}

@@ -78,7 +78,7 @@ class Layout(NamedTuple):
     line: timeline.Timeline
     last: int
     """The last epoch before markers are hidden."""
-    ahead: causal.Outlook
+    ahead: causal.Extrapolation
     """From each epoch whose belief is told in the window."""
     first: int
     """The first of those epochs."""
@@ -100,11 +100,11 @@ def lay_out(grade: ToolGrade) -> Layout:
         "layout", MOTION, seed=0, duration_s=DURATION_S, grade=grade
     )
     line = timeline.build(tight.MODEL, recording)
-    view = causal.outlook(line, recording.need_markers().latency_ns)
-    inside = (view.time_ns >= HIDDEN_S * 1e9) & (view.time_ns < DURATION_S * 1e9) & view.wanted
+    view = causal.plan_extrapolation(line, recording.need_markers().latency_ns)
+    inside = (view.time_ns >= HIDDEN_S * 1e9) & (view.time_ns < DURATION_S * 1e9) & view.latest
     chosen = np.flatnonzero(inside.any(axis=1))
     first = int(chosen[0])
-    view = view.starting(first)
+    view = view.from_epoch(first)
     t = view.time_ns / 1e9
     q, _ = MOTION.attitude.attitude(t.reshape(-1))
     x = MOTION.position(t.reshape(-1))[:, 0].reshape(t.shape)
@@ -219,7 +219,7 @@ class Running:
         ahead = jax.vmap(lambda knots: layout.ahead.with_input(knots).knots)(steps.knots)
         count = layout.ahead.time_ns.shape[0]
         flat = partial(jax.tree.map, lambda a: a.reshape(seeds * count, *a.shape[2:]))
-        told = causal.carry_on(
+        told = causal.extrapolate(
             tight.MODEL,
             repeated(params, seeds * count),
             flat(beliefs),

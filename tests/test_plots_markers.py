@@ -12,21 +12,21 @@ from jaxekf.recordings.truth import encoder_velocity_at
 from jaxekf.recordings.types import Encoder, Optical
 from jaxekf.reporting import plots
 from jaxekf.reporting.plots import _attitudes as attitudes
-from jaxekf.reporting.plots import _sight as sight
+from jaxekf.reporting.plots import _measurements as measurements
 from jaxekf.reporting.plots import _single_markers as single_markers
 from jaxekf.simulation import marker_runs
 from jaxekf.simulation.marker_runs import ToolGrade
 
 NAMES = (
     "attitude",
-    "position",
-    "velocity",
-    "rate",
     "bias",
+    "innovations",
     "occlusion",
     "path",
+    "position",
+    "rate",
+    "velocity",
     "visibility",
-    "innovations",
 )
 REFUSED = (20, 40, 60)
 """Frames in which marker 1 is 2 cm off."""
@@ -67,9 +67,10 @@ def curve(axes, label):
 
 def test_what_is_shown(made):
     """Would catch markers of which there is no picture, as when only optical.csv counts."""
-    assert plots.possible_figures(*made) == NAMES
+    assert plots.available_figures(*made) == NAMES
     lone = replace(made[0], sensors={})
-    assert plots.possible_figures(lone, made[1]) == NAMES[:-2]
+    rest = tuple(name for name in NAMES if name not in ("innovations", "visibility"))
+    assert plots.available_figures(lone, made[1]) == rest
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -129,7 +130,7 @@ def test_what_is_missing_is_left_out(made, tmp_path):
 
 def test_stretches_without_pose(made):
     """Would catch shading of the wrong stretch, or one that a hole of one frame makes."""
-    view = sight.look(*made)
+    view = measurements.pose_measurements(*made)
     (lost,), (blind,) = view.lost, view.blind
     np.testing.assert_allclose(lost, (1.494, 2.25), atol=0.01)
     np.testing.assert_allclose(blind, (1.998, 2.25), atol=0.01)
@@ -137,7 +138,7 @@ def test_stretches_without_pose(made):
     seen = made[1].markers.visible.copy()
     seen[30], seen[130:] = False, False
     ends = made[1].replace(markers=replace(made[1].markers, visible=seen))
-    (_, last) = sight.look(made[0], ends).blind
+    (_, last) = measurements.pose_measurements(made[0], ends).blind
     np.testing.assert_allclose(last, (129 * 0.018, made[0].time[-1]), atol=1e-9)
 
 
@@ -180,7 +181,7 @@ def test_a_pose_is_told_of_the_origin():
         p_body_tool=np.array([0.5, 0.0, 0.0]),
         latency_ns=1_000,
     )
-    plain = sight.at_origin(raw)
+    plain = measurements.at_origin(raw)
     assert plain.time_ns[0] == 4_000
     np.testing.assert_allclose(plain.position, [[1.0, 1.5, 3.0]], atol=1e-12)
     assert (plain.latency_ns, plain.p_body_tool) == (0, None)

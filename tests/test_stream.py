@@ -109,7 +109,7 @@ def test_input_out_of_order_is_refused():
     """Time that runs backwards, or a question before there is anything to answer it with."""
     one = run(11, duration_s=1.0)
     stream, _, _ = live(one)
-    with pytest.raises(ModelError, match="ask later"):
+    with pytest.raises(ModelError, match="call known after more input"):
         stream.known()
     stream.put_input(10, np.zeros(6))
     with pytest.raises(ModelError, match="increase"):

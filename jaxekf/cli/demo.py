@@ -79,7 +79,7 @@ def demo(output: Path, as_json: bool) -> None:
     every = [*training, *validation, *testing]
     # Figures and their libraries are imported by `_ahead`, while the compiler works.
     from jaxekf.cli.plot import draw
-    from jaxekf.reporting.plots import possible_figures
+    from jaxekf.reporting.plots import available_figures
 
     figures = []
     with whole_folder(output, "demo.json", overwrite=True) as folder:
@@ -89,7 +89,7 @@ def demo(output: Path, as_json: bool) -> None:
             made.save(folder / "result" / recording.name, diagnosis=found)
             chosen = ("attitude", "occlusion")
             if recording.name == "constant-rate":
-                chosen = possible_figures(made, recording)
+                chosen = available_figures(made, recording)
             files = draw(made, recording, folder / "figures", chosen)
             figures += [str(output / "figures" / file.name) for file in files]
         document = {

@@ -24,7 +24,7 @@ from jaxekf.cli.console import (
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import estimate_many
 from jaxekf.estimation.causal import estimate_online
-from jaxekf.estimation.output_times import Every, Requested, every, read_requested
+from jaxekf.estimation.output_times import Every, OutputTimes, every, read_output_times
 from jaxekf.estimation.result import Estimate, trackers
 from jaxekf.evaluation import metrics
 from jaxekf.evaluation.diagnosis import Diagnosis, diagnose, diagnose_many
@@ -228,7 +228,7 @@ def estimate(
 
 def _requested(
     files: tuple[Path, ...], distance: float | None, runs: int
-) -> list[Requested] | Every | None:
+) -> list[OutputTimes] | Every | None:
     """The instants that were asked for by one of two options, for each run or all."""
     if files and distance is not None:
         raise click.UsageError(
@@ -240,7 +240,7 @@ def _requested(
             " the files in the order of the runs"
         )
     if files:
-        times: list[Requested] = [read_requested(file) for file in files]
+        times: list[OutputTimes] = [read_output_times(file) for file in files]
         return times * runs if len(times) == 1 else times
     try:
         return None if distance is None else every(distance)
@@ -248,7 +248,7 @@ def _requested(
         raise click.UsageError(str(error)) from error
 
 
-def _inside(asked: Requested | Every | None, recording: Recording) -> Any:
+def _inside(asked: OutputTimes | Every | None, recording: Recording) -> Any:
     """Of what was asked for of a run, what lies in one of its parts; None for nothing."""
     if "part" not in recording.info or not isinstance(asked, np.ndarray):
         return asked

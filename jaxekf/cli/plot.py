@@ -31,7 +31,7 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
     """Write the named figures of one run."""
     folder.mkdir(parents=True, exist_ok=True)
     functions = plots.figure_functions()
-    possible = plots.possible_figures(made, recording)
+    possible = plots.available_figures(made, recording)
     missing = [name for name in names if name not in possible]
     if missing:
         raise ModelError(
@@ -82,7 +82,7 @@ def plot(
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
     for made, recording in zip(estimates, recordings, strict=True):
-        names = figures or plots.possible_figures(made, recording)
+        names = figures or plots.available_figures(made, recording)
         if not names:
             note(f"{made.run}: no figure: it needs ten instants or more")
         drawn = draw(made, recording, output, names)

@@ -12,7 +12,7 @@ from jaxekf.evaluation import metrics
 from jaxekf.evaluation.metrics import Score
 from jaxekf.io import run_folder
 from jaxekf.recordings.types import NANOSECONDS, Floats, Recording, period_ns
-from jaxekf.reporting.plots._sight import Sight, Stretch, look
+from jaxekf.reporting.plots._measurements import PoseMeasurements, Stretch, pose_measurements
 from jaxekf.reporting.report._saved import SavedResult
 
 _NAN = float("nan")
@@ -26,7 +26,7 @@ class Evidence(NamedTuple):
     recording: Recording | None
     missing: str
     """Why there is no recording; empty where there is one."""
-    sight: Sight | None
+    sight: PoseMeasurements | None
     lost: list[Stretch]
     """Begin and end, in seconds, of what is without a pose of the tracker."""
     score: Score | None
@@ -47,7 +47,7 @@ def gather(result: SavedResult) -> Evidence:
     recording, missing = _load(result)
     sight = None
     if recording is not None:
-        sight = look(result, recording)
+        sight = pose_measurements(result, recording)
         sight = sight if sight.label else None
     lost = _unseen(result) if sight is None else sight.lost
     score, held, raw, errors = None, _NAN, _NAN, {}

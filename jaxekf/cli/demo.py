@@ -1,4 +1,4 @@
-"""`jaxekf demo`: the main job on the bundled recordings, from tuning to pictures."""
+"""`jaxekf demo`: tuning, estimates and figures of the bundled recordings."""
 
 import json
 import time
@@ -11,7 +11,7 @@ import numpy as np
 
 import tuning
 from jaxekf.cli.comparison import print_comparison
-from jaxekf.cli.console import json_option, note, print_json, tuning_progress
+from jaxekf.cli.console import json_option, note, output_option, print_json, tuning_progress
 from jaxekf.estimation.batch import estimate_many, provenance
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.estimation.result import Estimate
@@ -26,13 +26,13 @@ from jaxekf.recordings.types import Recording
 from jaxekf.simulation import demo as runs
 from tuning.comparison.compare import as_dicts, compare_estimates
 
-# What one would write down from data sheets: a gyroscope's best case, a tracker's worst.
+# Values from data sheets: the best case of the gyroscope, the worst case of the tracker.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
 _ITERATIONS = 20
 
 
-def _ahead(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
-    """The runs that are held out and their estimates before tuning; imports what figures need."""
+def _prepare_test(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
+    """The test runs and their estimates before tuning; also imports the libraries of the figures."""
     testing = [load(path) for path in runs.paths(runs.TESTING)]
     made = estimate_many(testing, "loose", hand_set)
     import_module("jaxekf.cli.plot")
@@ -41,14 +41,14 @@ def _ahead(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
 
 
 @click.command()
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True
+@output_option(
+    "demo", "Folder for noise, estimates and figures; one of an earlier call is replaced."
 )
 @json_option
 def demo(output: Path, as_json: bool) -> None:
     """Tune on some bundled runs, estimate the others, and write tables, estimates and figures.
 
-    The recordings come from the package's own simulator. A demo folder of an earlier call is replaced.
+    The recordings are simulated. A demo folder of an earlier call is replaced.
     """
     check_output(output, "demo.json", overwrite=True)
     began = time.perf_counter()
@@ -60,9 +60,9 @@ def demo(output: Path, as_json: bool) -> None:
         [load(path) for path in runs.paths(names)] for names in (runs.TRAINING, runs.VALIDATION)
     )
     note(f"tuning on {', '.join(runs.TRAINING)}; validating on {', '.join(runs.VALIDATION)}")
-    with ThreadPoolExecutor(1) as beside:
-        # Much of the tuning is the compiler's time, in which another core is free.
-        ahead = beside.submit(_ahead, hand_set)
+    with ThreadPoolExecutor(1) as background:
+        # Much of the tuning is compilation on one core; another core is free.
+        prepared = background.submit(_prepare_test, hand_set)
         with tuning_progress(_ITERATIONS) as progress:
             tuned = tuning.tune(
                 training,
@@ -72,12 +72,12 @@ def demo(output: Path, as_json: bool) -> None:
                 iterations=_ITERATIONS,
                 progress=progress,
             )
-        testing, by_hand = ahead.result()
+        testing, before = prepared.result()
     note(f"estimating {', '.join(runs.TESTING)}")
-    estimates = {"hand-set": by_hand, "tuned": estimate_many(testing, model, tuned.params)}
+    estimates = {"hand-set": before, "tuned": estimate_many(testing, model, tuned.params)}
     compared = compare_estimates(testing, estimates)
     every = [*training, *validation, *testing]
-    # Figures and their libraries are imported by `_ahead`, while the compiler works.
+    # `_prepare_test` has imported the figures and their libraries, during the compilation.
     from jaxekf.cli.plot import draw
     from jaxekf.reporting.plots import available_figures
 
@@ -105,12 +105,12 @@ def demo(output: Path, as_json: bool) -> None:
             "figures": figures,
         }
         (folder / "demo.json").write_text(json.dumps(document, indent=2) + "\n", "utf-8")
-    # Beside the file, not in it: what is written of the same runs is the same.
+    # Not in the file, so that the same runs give the same file.
     document["seconds"] = round(time.perf_counter() - began, 1)
     if as_json:
         print_json(document)
         return
-    print_comparison("Runs the tuner has not seen", compared.rows)
+    print_comparison("Test runs, not used for tuning", compared.rows)
     for name, value in document["noise_deg"].items():
         unit = model.units.noise._asdict()[name].replace("rad", "deg", 1)
         click.echo(f"  {name:<10} {_HAND_SET_DEG[name]:>7} -> {value:.4f} {unit}")

@@ -10,6 +10,7 @@ from jaxekf.cli.console import (
     model_option,
     noise_option,
     note,
+    output_option,
     print_json,
     robust_option,
     sort_option,
@@ -28,14 +29,14 @@ FIGURES = tuple(plots.figure_functions())
 
 
 def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]) -> list[Path]:
-    """Write the named figures of one run."""
+    """Write the named figures of one run into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     functions = plots.figure_functions()
-    possible = plots.available_figures(made, recording)
-    missing = [name for name in names if name not in possible]
+    available = plots.available_figures(made, recording)
+    missing = [name for name in names if name not in available]
     if missing:
         raise ModelError(
-            f"run '{made.run}': got the figures {missing}, expected some of {list(possible)} for this"
+            f"run '{made.run}': got the figures {missing}, expected some of {list(available)} for this"
             " model and recording; leave the others out"
         )
     return [
@@ -51,15 +52,13 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
     "figures",
     multiple=True,
     type=click.Choice(FIGURES),
-    help="Which; repeatable.  [default: all]",
+    help="Figure to draw; repeatable.  [default: all that model and recording have data for]",
 )
 @model_option
 @robust_option
 @noise_option
 @sort_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("figures"), show_default=True
-)
+@output_option("figures", "Folder for the PNG files RUN_FIGURE.png.")
 @json_option
 def plot(
     runs: tuple[Path, ...],
@@ -71,11 +70,11 @@ def plot(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Estimate RUNS and draw what model and recording can show.
+    """Estimate RUNS and draw figures of the estimates.
 
-    attitude, position, velocity, rate: values, and errors where there is an encoder; bias; occlusion: the
-    longest time without a pose; path in three dimensions; of single markers visibility (used, refused,
-    hidden) and innovations.
+    attitude, position, velocity, rate: values, and errors if there is an encoder. bias: gyroscope and
+    accelerometer. occlusion: the longest time without a pose. path: in three dimensions. visibility and
+    innovations: of single markers.
     """
     chosen = get_model(model) if means is None else robust(model, means)
     recordings = load_runs(runs, sort=sort, model=chosen)
@@ -84,7 +83,7 @@ def plot(
     for made, recording in zip(estimates, recordings, strict=True):
         names = figures or plots.available_figures(made, recording)
         if not names:
-            note(f"{made.run}: no figure: it needs ten instants or more")
+            note(f"{made.run}: no figure, since it has fewer than ten instants")
         drawn = draw(made, recording, output, names)
         files += drawn
         for file in drawn:

@@ -31,7 +31,7 @@ from jaxekf.recordings.types import NANOSECONDS, Recording
 Run = Recording | Path | str
 _BATCH_BYTES = 1 << 30
 _HIGH_REJECTION = 0.2
-"""A note says so if the gate rejects a larger fraction of a sensor's samples."""
+"""Fraction of a sensor's samples; a note warns if the gate rejects more."""
 
 
 def require_float64() -> None:

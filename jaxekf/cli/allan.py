@@ -102,15 +102,15 @@ def _print_sensor(label: str, sensor: SensorNoise) -> None:
     white, walk = ("deg/s/√Hz", "deg/s²/√Hz") if turn != 1.0 else ("m/s²/√Hz", "m/s³/√Hz")
     floor, at = sensor.floor()
     rows = []
-    for i, (axis, made) in enumerate(zip(AXES, sensor.axes, strict=True)):
+    for i, (axis, noise) in enumerate(zip(AXES, sensor.axes, strict=True)):
         rows.append(
             [
                 axis,
-                *_with_interval(made.white, turn),
+                *_with_interval(noise.white, turn),
                 f"{turn * floor[i]:.3g}",
                 f"{at[i]:.3g}",
-                f"{turn * made.flicker:.3g}" if made.flicker else "–",
-                *_with_interval(made.walk, turn),
+                f"{turn * noise.flicker:.3g}" if noise.flicker else "–",
+                *_with_interval(noise.walk, turn),
             ]
         )
     unit = white.split("/√")[0]

@@ -45,12 +45,12 @@ class Commands(click.Group):
             formatter.write_dl([(name, self.places[name].summary) for name in sorted(self.places)])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        found = [
+        names = [
             CompletionItem(name, help=place.summary)
             for name, place in sorted(self.places.items())
             if name.startswith(incomplete)
         ]
-        return found + click.Command.shell_complete(self, ctx, incomplete)
+        return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -34,10 +34,10 @@ _ITERATIONS = 20
 def _prepare_test(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
     """The test runs and their estimates before tuning; also imports the libraries of the figures."""
     testing = [load(path) for path in runs.paths(runs.TESTING)]
-    made = estimate_many(testing, "loose", hand_set)
+    estimates = estimate_many(testing, "loose", hand_set)
     import_module("jaxekf.cli.plot")
     import_module("scipy.stats")
-    return testing, made
+    return testing, estimates
 
 
 @click.command()

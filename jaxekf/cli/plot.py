@@ -28,19 +28,21 @@ from jaxekf.reporting import plots
 FIGURES = tuple(plots.figure_functions())
 
 
-def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]) -> list[Path]:
+def draw(
+    estimate: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]
+) -> list[Path]:
     """Write the named figures of one run into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     functions = plots.figure_functions()
-    available = plots.available_figures(made, recording)
+    available = plots.available_figures(estimate, recording)
     missing = [name for name in names if name not in available]
     if missing:
         raise ModelError(
-            f"run '{made.run}': got the figures {missing}, expected some of {list(available)} for this"
+            f"run '{estimate.run}': got the figures {missing}, expected some of {list(available)} for this"
             " model and recording; leave the others out"
         )
     return [
-        plots.save(functions[name](made, recording), folder / f"{made.run}_{name}.png")
+        plots.save(functions[name](estimate, recording), folder / f"{estimate.run}_{name}.png")
         for name in names
     ]
 
@@ -80,11 +82,11 @@ def plot(
     recordings = load_runs(runs, sort=sort, model=chosen)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
-    for made, recording in zip(estimates, recordings, strict=True):
-        names = figures or plots.available_figures(made, recording)
+    for estimate, recording in zip(estimates, recordings, strict=True):
+        names = figures or plots.available_figures(estimate, recording)
         if not names:
-            note(f"{made.run}: no figure, since it has fewer than ten instants")
-        drawn = draw(made, recording, output, names)
+            note(f"{estimate.run}: no figure, since it has fewer than ten instants")
+        drawn = draw(estimate, recording, output, names)
         files += drawn
         for file in drawn:
             wrote(file)

@@ -211,9 +211,9 @@ def filter_timelines(
             devices = sharing_devices()
             names = [lines[i].name for i in members[start : start + size]]
             with memory.for_runs(names):
-                found = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
+                filtered = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
             for place in range(min(size, len(members) - start)):
-                one = jax.tree.map(lambda a, place=place: a[place], found)
+                one = jax.tree.map(lambda a, place=place: a[place], filtered)
                 _check(model, lines[members[start + place]], one[0])
                 results[members[start + place]] = one
     return [results[i] for i in range(len(lines))]
@@ -245,9 +245,9 @@ def _run(
     cov = jax.vmap(model.initial_covariance)(every)
     given = (model, every, Belief(means, cov), steps)
     if smooth:
-        found = smoother.run_smoother_batch(*given, devices=devices)
-        instants = found.filtered.instants._replace(updated=found.smoothed)
-        output = found.filtered._replace(instants=instants)
+        both = smoother.run_smoother_batch(*given, devices=devices)
+        instants = both.filtered.instants._replace(updated=both.smoothed)
+        output = both.filtered._replace(instants=instants)
     else:
         output = ekf.run_filter_batch(*given, devices=devices)
     return output, evaluate_outputs(model, every, output)
@@ -259,7 +259,7 @@ def evaluate_outputs(
     """Value and covariance of each output of the model by name, with leading axes (runs, K, S)."""
 
     def one(params: Parameters, belief: Belief, u: Any) -> dict[str, tuple[Any, Array]]:
-        found = {}
+        values = {}
         for out in model.outputs:
             value = out.value(belief.mean, u, params)
 
@@ -272,8 +272,8 @@ def evaluate_outputs(
             cov = jacobian @ belief.cov @ jacobian.T
             if out.noise is not None:
                 cov = cov + out.noise(u, params)
-            found[out.name] = (value, 0.5 * (cov + cov.T))
-        return found
+            values[out.name] = (value, 0.5 * (cov + cov.T))
+        return values
 
     over_steps = jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
     return jax.vmap(over_steps)(params, output.instants.updated, output.inputs)
@@ -384,7 +384,7 @@ def _as_estimate(
     if smooth:
         notes += ("smoothed: each instant is estimated from the whole run",)
     total = float(flat(output.instants.log_likelihood).sum())
-    made = Estimate(
+    estimated = Estimate(
         run=recording.name,
         model=model,
         time_ns=line.time_ns[valid],
@@ -406,8 +406,8 @@ def _as_estimate(
         },
     )
     if line.requested_ns is None or line.measured_ns is None:
-        return made
-    return made.split(np.isin(made.time_ns, line.measured_ns), line.requested_ns)
+        return estimated
+    return estimated.split(np.isin(estimated.time_ns, line.measured_ns), line.requested_ns)
 
 
 def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:

@@ -152,35 +152,38 @@ def estimate_online(
     """
     recording = read([run])[0]
     _need_input(get_model(model))
-    made = estimate_many([recording], model, params)[0]
-    line = timeline.build(made.model, recording)
+    filtered = estimate_many([recording], model, params)[0]
+    line = timeline.build(filtered.model, recording)
     latency = set(line.latency_ns.values())
     if len(latency) != 1:
         raise ModelError(
             f"run '{line.name}': got sensors with latencies of {sorted(line.latency_ns.items())} ns,"
             " expected the same for all; use a jaxekf.Stream instead"
         )
-    chosen, late = made.model, latency.pop()
+    chosen, late = filtered.model, latency.pop()
     shift = 0.0
     if chosen.input is not None:
         shift = float(
-            jnp.max(jnp.abs(chosen.input.shift(made.params, jnp.asarray(line.steps.time))))
+            jnp.max(jnp.abs(chosen.input.shift(filtered.params, jnp.asarray(line.steps.time))))
         )
     view = plan_extrapolation(line, late, shift)
-    at = np.searchsorted(made.time_ns, line.time_ns[:, -1])
-    beliefs = Belief(jax.tree.map(lambda a: a[at], made.state), jnp.asarray(made.cov[at]))
+    at = np.searchsorted(filtered.time_ns, line.time_ns[:, -1])
+    beliefs = Belief(jax.tree.map(lambda a: a[at], filtered.state), jnp.asarray(filtered.cov[at]))
     extrapolated = _extrapolate_in_batches(
-        chosen, made.params, beliefs, view.with_input(_knots(line))
+        chosen, filtered.params, beliefs, view.with_input(_knots(line))
     )
     belief, outputs = jax.tree.map(lambda a: a[:, :, 0][view.latest], extrapolated)
     return replace(
-        made,
+        filtered,
         time_ns=view.time_ns[view.latest],
         state=belief.mean,
         cov=belief.cov,
         outputs=named_outputs(chosen, outputs),
         online=True,
-        notes=(*made.notes, f"causal: only measurements that had arrived, {late / 1e6:g} ms late"),
+        notes=(
+            *filtered.notes,
+            f"causal: only measurements that had arrived, {late / 1e6:g} ms late",
+        ),
     )
 
 
@@ -208,6 +211,6 @@ def _extrapolate_in_batches(model: Model, params: Parameters, beliefs: Belief, s
         # The last epoch fills up the last batch, since another size would need another program.
         index = np.minimum(np.arange(start, start + size), count - 1)
         given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (beliefs, steps))
-        found = jax.tree.map(np.asarray, _extrapolated_outputs(model, params, *given))
-        parts.append(jax.tree.map(lambda a, s=start: a[: min(size, count - s)], found))
+        batch = jax.tree.map(np.asarray, _extrapolated_outputs(model, params, *given))
+        parts.append(jax.tree.map(lambda a, s=start: a[: min(size, count - s)], batch))
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)

@@ -163,14 +163,14 @@ class Stream:
         ModelError
             The model has no such sensor, or the sample does not have the shapes of its space.
         """
-        found = self.model.sensor(sensor)
+        definition = self.model.sensor(sensor)
         late = taken_ns < self._base_ns or (taken_ns == self._base_ns and not self._base_is_open)
         if late:
             self.dropped[sensor] += 1
             return False
-        _check_shapes(found, value)
-        rows = np.broadcast_to(np.asarray(mask, bool), found.rows)
-        aux = found.aux_like if aux is None else aux
+        _check_shapes(definition, value)
+        rows = np.broadcast_to(np.asarray(mask, bool), definition.rows)
+        aux = definition.aux_like if aux is None else aux
         self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
         return True
 
@@ -248,10 +248,10 @@ class Stream:
         blank = _Sample(
             _zeros(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.aux_like)
         )
-        found = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
+        samples = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
         value, mask, aux = (
             jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a])[:, None], *parts)
-            for parts in zip(*found, strict=True)
+            for parts in zip(*samples, strict=True)
         )
         return Rows(value, aux, mask, np.full((len(instants), 1), self._period(sensor.name)))
 

@@ -52,11 +52,11 @@ def bucketed(timelines: Sequence[Timeline]) -> Steps:
 
 def groups(timelines: Sequence[Timeline]) -> list[list[int]]:
     """Indices of the runs that are padded to the same length, for each length, the shortest first."""
-    found: dict[tuple[int, int], list[int]] = {}
+    by_length: dict[tuple[int, int], list[int]] = {}
     for i, line in enumerate(timelines):
         epochs, substeps = line.steps.dt.shape
-        found.setdefault((bucket(epochs), substeps), []).append(i)
-    return [found[key] for key in sorted(found)]
+        by_length.setdefault((bucket(epochs), substeps), []).append(i)
+    return [by_length[key] for key in sorted(by_length)]
 
 
 def _knot_count(steps: Steps) -> int:

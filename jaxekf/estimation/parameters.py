@@ -64,14 +64,14 @@ def described_arrays(model: Model, params: Parameters) -> dict[str, tuple[Any, s
 
     The setup, which comes from the recording, is in SI units.
     """
-    found = {}
+    described = {}
     for section in (*_SECTIONS, "setup"):
         values, units = getattr(params, section), getattr(model.units, section)
         names, leaves = leaf_names(values), jax.tree.leaves(values)
         unit_names = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
         for name, leaf, unit in zip(names, leaves, unit_names, strict=True):
-            found[f"{section}/{name}"] = (np.asarray(leaf), unit)
-    return found
+            described[f"{section}/{name}"] = (np.asarray(leaf), unit)
+    return described
 
 
 def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]) -> None:

@@ -104,7 +104,7 @@ def build(
     if model.input is not None:
         counted[model.input.name] = model.input.source(recording)
         driver = _check_input(counted[model.input.name], recording, model.input.name)
-    start, end, found = _run_interval(model, recording, samples, driver)
+    start, end, start_sample = _run_interval(model, recording, samples, driver)
     account = {
         name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
         for name, stream in counted.items()
@@ -125,7 +125,7 @@ def build(
     if driver is not None:
         inside = (driver.time_ns >= start) & (driver.time_ns <= end)
         events.append(driver.time_ns[inside])
-    notes = (found.note,) if found is not None and found.note else ()
+    notes = (start_sample.note,) if start_sample is not None and start_sample.note else ()
     if part := recording.info.get("part"):
         notes = (f"part {part}", *notes)
     if driver is None and model.hold_to is None:
@@ -148,15 +148,17 @@ def build(
     steps, step_times = _arrange(times, index, samples, slow, start)
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
-    if found is None:
-        found = Start(start, {name: first_visible(stream) for name, stream in samples.items()})
+    if start_sample is None:
+        start_sample = Start(
+            start, {name: first_visible(stream) for name, stream in samples.items()}
+        )
     latency = {name: stream.latency_ns for name, stream in samples.items()}
     setup = model.parameters.setup if model.setup is None else model.setup(recording)
     return Timeline(
         recording.name,
         steps,
         step_times,
-        found.first,
+        start_sample.first,
         account,
         notes,
         setup,
@@ -326,15 +328,15 @@ def _run_interval(
     if model.find_start is None:
         return start, end, None
     inside = {name: cut(stream, start, end) for name, stream in samples.items()}
-    found = model.find_start(recording, inside)
-    if found is None:
+    start_sample = model.find_start(recording, inside)
+    if start_sample is None:
         raise RecordingError(
             place,
             f"no instant at which '{model.name}' can start",
             "at least one (see the model)",
             "a run in which enough is seen at once: markers of the tool, or landmarks in an image",
         )
-    return found.time_ns, end, found
+    return start_sample.time_ns, end, start_sample
 
 
 def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:

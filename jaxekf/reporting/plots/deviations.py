@@ -55,11 +55,11 @@ def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
             ms=3,
             label=f"{axis}, 95 % band",
         )
-    for made, colour in zip(sensor.axes, _COLOURS, strict=True):
+    for noise, colour in zip(sensor.axes, _COLOURS, strict=True):
         # Averaging times below a period of the highest frequency used are not part of the fit.
-        tau = curve.tau[curve.tau >= 0.9 * min(0.5 / made.band_hz, curve.tau[-1])]
+        tau = curve.tau[curve.tau >= 0.9 * min(0.5 / noise.band_hz, curve.tau[-1])]
         label = "fit" if colour == _COLOURS[0] else None
-        axes.plot(tau, turn * made.deviation(tau), color=colour, lw=1, label=label)
+        axes.plot(tau, turn * noise.deviation(tau), color=colour, lw=1, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
     # The bands, not the slopes, determine the limits; at least a decade, so that the scale has labels.

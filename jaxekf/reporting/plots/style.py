@@ -82,9 +82,9 @@ def finish(figure: Figure, grid: Any, title: str) -> None:
 def save(figure: Figure, file: Path | str) -> Path:
     """Write a figure as a PNG file, atomically; an existing file is replaced."""
     canvas = FigureCanvasAgg(figure)
-    with styled(), whole_file(file, overwrite=True) as made:
+    with styled(), whole_file(file, overwrite=True) as temporary:
         figure.set_dpi(STYLE["savefig.dpi"])
         # `savefig` would lay out and draw twice, which doubles the time.
         canvas.draw()
-        imsave(made, canvas.buffer_rgba(), format="png", dpi=figure.dpi)
+        imsave(temporary, canvas.buffer_rgba(), format="png", dpi=figure.dpi)
     return Path(file)

@@ -95,15 +95,15 @@ def _masked(recording: Recording, label: str, stream: Any) -> dict[str, Flags]:
     """Flags of the unused samples of a stream, by reason."""
     bad = ~getattr(stream, "valid", np.ones(len(stream.time_ns), bool))
     account = recording.intake.get(label)
-    found: dict[str, Flags] = {}
+    by_reason: dict[str, Flags] = {}
     for name, reason in ({} if account is None else account.masked).items():
         flags = np.isin(stream.time_ns, reason.time_ns)
         if flags.any():
-            found[name] = flags
+            by_reason[name] = flags
             bad = bad & ~flags
     if bad.any():
-        found["not valid"] = bad
-    return found
+        by_reason["not valid"] = bad
+    return by_reason
 
 
 def _density(

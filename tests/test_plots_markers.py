@@ -146,14 +146,14 @@ def test_visibility_accounts_for_every_frame(made, figures):
     """Would catch a refused sample shown as used or hidden, or a frame counted twice."""
     frames = made[1].markers.time_ns - made[1].markers.latency_ns
     for name, record in single_markers.marker_sensors(*made).items():
-        fate = single_markers._fate(frames, record)
-        assert np.all(np.sum(fate, axis=0) == 1)
+        usage = single_markers._usage(frames, record)
+        assert np.all(np.sum(usage, axis=0) == 1)
         at = made[1].markers.names.index(name)
-        np.testing.assert_array_equal(fate.hidden, ~made[1].markers.visible[:, at])
+        np.testing.assert_array_equal(usage.hidden, ~made[1].markers.visible[:, at])
         if name == "1":
-            assert fate.refused[list(REFUSED)].all()
+            assert usage.refused[list(REFUSED)].all()
         account = made[0].account[f"marker_{name}"]
-        assert fate.refused.sum() == account["gated"]
+        assert usage.refused.sum() == account["gated"]
     texts = [text.get_text() for text in figures["visibility"].axes[0].texts]
     hidden = 100.0 * np.mean(~made[1].markers.visible, axis=0)
     assert all(f"{share:.1f} % hidden" in text for share, text in zip(hidden, texts, strict=True))

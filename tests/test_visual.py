@@ -367,7 +367,7 @@ def test_figures_of_a_camera(tmp_path):
     run = camera_recording("run", seed=2, duration_s=SECONDS, grade=few(), blind=blind)
     made = jaxekf.estimate(run, "visual")
     names = plots.available_figures(made, run)
-    assert names == ("attitude", "position", "velocity", "rate", "bias", "occlusion", "path")
+    assert names == ("attitude", "bias", "occlusion", "path", "position", "rate", "velocity")
     for name in names:
         figure = plots.figure_functions()[name](made, run)
         plots.save(figure, tmp_path / f"{name}.png")

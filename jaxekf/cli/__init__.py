@@ -7,7 +7,7 @@ in `_SUMMARIES`.
 import click
 
 from jaxekf import __version__
-from jaxekf.cli.commands import Commands, Place
+from jaxekf.cli.commands import LazyCommand, LazyGroup
 
 _SUMMARIES = {
     "align": "Clock offset and rotation between tracker and IMU.",
@@ -22,17 +22,17 @@ _SUMMARIES = {
     "tune": "Noise and calibration, tuned by gradient on runs.",
 }
 # A Python module or function cannot have the name `import`.
-_ELSEWHERE = {"import": ("imports", "import_run")}
+_OTHER_NAMES = {"import": ("imports", "import_run")}
 
 
-def _place(name: str) -> Place:
-    module, attribute = _ELSEWHERE.get(name, (name, name))
-    return Place(f"jaxekf.cli.{module}", attribute, _SUMMARIES[name])
+def _lazy_command(name: str) -> LazyCommand:
+    module, attribute = _OTHER_NAMES.get(name, (name, name))
+    return LazyCommand(f"jaxekf.cli.{module}", attribute, _SUMMARIES[name])
 
 
 @click.group(
-    cls=Commands,
-    places={name: _place(name) for name in _SUMMARIES},
+    cls=LazyGroup,
+    lazy_commands={name: _lazy_command(name) for name in _SUMMARIES},
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="jaxekf")

@@ -18,7 +18,7 @@ _SIGINT_STATUS = 130
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class Place(NamedTuple):
+class LazyCommand(NamedTuple):
     """A command that is not imported yet."""
 
     module: str
@@ -26,28 +26,32 @@ class Place(NamedTuple):
     summary: str
 
 
-class Commands(click.Group):
+class LazyGroup(click.Group):
     """A group that imports a command only to run it, so that its help does not import JAX and SciPy."""
 
-    def __init__(self, *args: Any, places: Mapping[str, Place], **options: Any) -> None:
+    def __init__(
+        self, *args: Any, lazy_commands: Mapping[str, LazyCommand], **options: Any
+    ) -> None:
         super().__init__(*args, **options)
-        self.places = dict(places)
+        self.lazy_commands = dict(lazy_commands)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(self.places)
+        return sorted(self.lazy_commands)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        place = self.places.get(cmd_name)
-        return place and getattr(import_module(place.module), place.attribute)
+        lazy = self.lazy_commands.get(cmd_name)
+        return lazy and getattr(import_module(lazy.module), lazy.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, self.places[name].summary) for name in sorted(self.places)])
+            formatter.write_dl(
+                [(name, lazy.summary) for name, lazy in sorted(self.lazy_commands.items())]
+            )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         names = [
-            CompletionItem(name, help=place.summary)
-            for name, place in sorted(self.places.items())
+            CompletionItem(name, help=lazy.summary)
+            for name, lazy in sorted(self.lazy_commands.items())
             if name.startswith(incomplete)
         ]
         return names + click.Command.shell_complete(self, ctx, incomplete)

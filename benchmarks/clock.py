@@ -1,4 +1,4 @@
-"""Time that a function takes: to build its program, and to run it."""
+"""Times of a function: to trace, lower and compile it, and to run it."""
 
 import statistics
 import sys
@@ -10,10 +10,10 @@ import jax
 
 
 class Build(NamedTuple):
-    """A compiled program, and the seconds of each stage that led to it."""
+    """A compiled program, and the seconds of each stage of its compilation."""
 
     program: Any
-    """To be called with arguments like those it was built for."""
+    """The compiled function, for arguments of the same shapes."""
     trace_s: float
     lower_s: float
     compile_s: float
@@ -27,11 +27,11 @@ class Build(NamedTuple):
 
 
 def build(function: Any, *args: Any) -> Build:
-    """Build a jitted function for these arguments, with nothing left of what was built before.
+    """Compile a jitted function for these arguments, after all caches in memory are cleared.
 
-    Programs kept on disk are not forgotten: the caller turns them off (`jax_enable_compilation_cache`).
+    The caller must disable the cache on disk (`jax_enable_compilation_cache`).
     """
-    forget()
+    clear_caches()
     times = [time.perf_counter()]
     traced = function.trace(*args)
     times.append(time.perf_counter())
@@ -42,8 +42,8 @@ def build(function: Any, *args: Any) -> Build:
     return Build(program, *(b - a for a, b in pairwise(times)), _operations(lowered))
 
 
-def forget() -> None:
-    """Clear JAX's caches, and those that the package keeps of models it has seen."""
+def clear_caches() -> None:
+    """Clear the caches of JAX and those of this package."""
     jax.clear_caches()
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] == "jaxekf":
@@ -73,10 +73,9 @@ class Timing(NamedTuple):
 
 
 def timed(function: Any, *args: Any, seconds: float) -> Timing:
-    """Time a function.
+    """Time the first call of a function, and later calls for about `seconds`.
 
-    Later calls go on for `seconds`: three at least, or one where it takes five times as long, and thirty
-    at most.
+    There are 3 to 30 later calls, or fewer than 3 if these take longer than five times `seconds`.
     """
     begin = time.perf_counter()
     result = jax.block_until_ready(function(*args))

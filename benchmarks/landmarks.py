@@ -27,26 +27,26 @@ class Prepared(NamedTuple):
 
     model: Model
     plain: Model
-    """The same without gates, which textbook JAX does not have."""
+    """The model without gates, which textbook JAX does not have."""
     params: Parameters
     belief: Belief
     steps: Steps
     flat: Any
-    """The steps of the run as textbook JAX takes them."""
+    """The steps of the run in the form for textbook JAX."""
 
     @property
     def free(self) -> Parameters:
-        """The parameters without what the recording states."""
+        """The parameters without the setup, which comes from the recording."""
         return self.params._replace(setup=())
 
 
 def recorded(seconds: float, points: int = POINTS) -> Recording:
-    """The eight, `seconds` long, with this number of landmarks in (nearly) every image."""
+    """A figure eight of `seconds`, with this number of landmarks in (nearly) every image."""
     return camera_recording("run", seed=1, duration_s=seconds, grade=CameraGrade(points=points))
 
 
 def prepare(run: Recording) -> Prepared:
-    """What both filters of a recording take."""
+    """The arguments of both filters of a recording."""
     model = visual.adapt(False, [run])
     line = timeline.build(model, run)
     params = as_arrays(model.parameters)._replace(setup=line.setup)
@@ -55,7 +55,7 @@ def prepare(run: Recording) -> Prepared:
     return Prepared(model, robust(model, "none"), params, belief, steps, flattened(line.steps))
 
 
-# Steps are arguments: as constants they would be folded into the program for minutes.
+# Steps are arguments, because constant folding would take minutes.
 def filtered(run: Prepared, model: Model, free: Parameters, steps: Steps) -> tuple[Any, Array]:
     """Updated means of the run by the package, and the likelihood of all samples."""
     params = free._replace(setup=run.params.setup)
@@ -74,7 +74,7 @@ def textbook(model: Model, params: Parameters, belief: Belief, flat: Any) -> tup
     def updated(samples: dict[str, Rows], ahead: Belief) -> tuple[Belief, Array]:
         h, e, r = linearise(model, params, ahead.mean, None, samples)
         mask = jnp.concatenate([rows.mask for rows in samples.values()])
-        # Masked rows have no slope, no error and unit noise: they change nothing.
+        # Masked rows have zero Jacobian, zero innovation and unit noise, and so no effect.
         h, e = jnp.where(mask[:, None], h, 0.0), jnp.where(mask, e, 0.0)
         r = jnp.where(mask[:, None] & mask, r, jnp.diag(jnp.where(mask, 0.0, 1.0)))
         return correct(model, ahead, h, e, r, jnp.sum(mask))
@@ -96,7 +96,7 @@ def textbook(model: Model, params: Parameters, belief: Belief, flat: Any) -> tup
 
 
 def flattened(steps: Steps) -> Any:
-    """One instant after the other; images, which are at the ends of epochs, masked elsewhere."""
+    """Steps with one leading axis of instants; images are masked except at the ends of epochs."""
     epochs, substeps = np.shape(steps.dt)
 
     def flat(a: Any) -> Array:
@@ -112,8 +112,8 @@ def flattened(steps: Steps) -> Any:
 def of_many(flat: Any, runs: int) -> tuple[Any, Any]:
     """`flattened` steps with the values repeated for each run on a new first axis, and axes for `vmap`.
 
-    Only values have that axis. Masks are shared, so that `lax.cond` still leaves out the instants without
-    an image.
+    Only values have that axis. Masks are shared, so that `lax.cond` still skips the instants without an
+    image.
     """
 
     def each(rows: Rows) -> Rows:

@@ -1,7 +1,8 @@
-"""Many runs of random lengths through `estimate` and `tune`: ``python benchmarks/lengths.py [--quick]``.
+"""Runs of many different lengths in `estimate` and `tune`: ``python benchmarks/lengths.py [--quick]``.
 
-Counts the programs compiled against the buckets of lengths, times a first and a second pass, and compares
-every estimate with the same run filtered alone and unpadded. Prints a table and, last, one line of JSON.
+Compares the number of compiled programs with the number of padded lengths, times a first and a second pass,
+and compares estimates with those of the same run filtered alone without padding. Prints a table and, as the
+last line, JSON.
 """
 
 import argparse
@@ -28,11 +29,11 @@ from jaxekf.simulation import attitude_runs
 from tuning.search import evaluation
 
 _RATE = attitude_runs.SensorGrade().optical_hz
-"""Steps a second: the gyroscope is an input, each tracker sample a step."""
+"""Steps per second: the gyroscope is an input, each tracker sample a step."""
 
 
 def recordings(count: int, shortest: int, longest: int) -> list[Any]:
-    """Simulated runs whose numbers of steps are drawn evenly."""
+    """Simulated runs with uniformly distributed numbers of steps."""
     lengths = np.random.default_rng(6).uniform(shortest, longest, count)
     return [
         attitude_runs.recording(
@@ -46,7 +47,7 @@ def recordings(count: int, shortest: int, longest: int) -> list[Any]:
 
 
 def difference(model: Any, lines: list[Any], found: list[Any]) -> float:
-    """The largest relative difference to runs filtered alone, unpadded."""
+    """The largest relative difference from runs filtered alone without padding."""
     params = jax.tree.map(jnp.asarray, model.parameters)
     worst = 0.0
     for line, estimate in zip(lines, found, strict=True):
@@ -63,34 +64,34 @@ def difference(model: Any, lines: list[Any], found: list[Any]) -> float:
 
 
 def timed(function: Any) -> tuple[Any, float]:
-    """What it returns, and the seconds it took."""
+    """The result of a function, and the seconds it took."""
     begin = time.perf_counter()
     found = function()
     return found, time.perf_counter() - begin
 
 
 def main() -> None:
-    """Run it."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs")
-    parser.add_argument("--smoke", action="store_true", help="two tiny runs, to see that it ends")
+    parser.add_argument("--smoke", action="store_true", help="two tiny runs")
     arguments = parser.parse_args()
     count, shortest, longest, compared = (100, 500, 20_000, 10)
     if arguments.quick:
         count, shortest, longest, compared = (12, 100, 1_000, 3)
     if arguments.smoke:
-        # Of one length after padding: one program each.
+        # Both runs have the same length after padding, so that one program is enough.
         count, shortest, longest, compared = (2, 29, 31, 1)
     iterations = 1 if arguments.smoke else 3
     model = jaxekf.get_model("loose")
     with Progress(disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("simulating", total=5)
 
-        def done(what: str) -> None:
-            progress.update(task, advance=1, description=what)
+        def done(following: str) -> None:
+            progress.update(task, advance=1, description=following)
 
         runs = recordings(count, shortest, longest)
-        lines = jaxekf.batch.timeline.build_many(model, runs)
+        lines = jaxekf.timeline.build_many(model, runs)
         buckets = len(padding.groups(lines))
         done("estimating")
         found, first = timed(lambda: jaxekf.estimate_many(runs, model))
@@ -131,7 +132,7 @@ def main() -> None:
 
 
 def report(found: dict[str, Any]) -> None:
-    """Print what is known so far."""
+    """Print one result per line."""
     for name, value in found.items():
         print(f"{name}: {value}", flush=True)
 

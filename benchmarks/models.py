@@ -1,7 +1,8 @@
-"""Models against the same models in plain textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`.
+"""Models compared with the same models in textbook JAX: Jacobians by `jacfwd`, `@`, `cho_solve`.
 
-The work is the value and the gradient to all parameters of the likelihood of `RUNS` runs, with
-``keep="means"``. Operations are counted at `COUNTED` runs; textbook JAX has as many for any number.
+The work is the likelihood of `RUNS` runs and its gradient with respect to all parameters, with
+``keep="means"``. Operations are counted for `COUNTED` runs; those of textbook JAX do not depend on
+the number of runs.
 """
 
 import sys
@@ -37,7 +38,7 @@ _DT = 0.01
 
 
 def _markers() -> Model:
-    """A toy with an accelerometer before its gyroscope, and the quality of a marker in `aux`."""
+    """A test model with an accelerometer and a gyroscope, and the quality of a marker in `aux`."""
     sensors = tuple(replace(sensor, aux_like=1.0) for sensor in toy_models.MARKERS.sensors)
     return replace(toy_models.MARKERS, sensors=sensors)
 
@@ -49,14 +50,14 @@ CONTENDERS: dict[str, Callable[[], Model]] = {
     },
     "markers": _markers,
 }
-"""Three markers in `tight`; 12 degrees of freedom and 9 rows in `marg`; `visual` as in `vision.py`; a toy
-of 15 degrees of freedom. They have no gates, as textbook JAX has none."""
+"""`tight` has three markers; `marg` 12 degrees of freedom and 9 rows; `visual` is that of `vision.py`; the
+test model has 15 degrees of freedom. They have no gates, since textbook JAX has none."""
 MAIN = tuple(name for name in CONTENDERS if name != "markers")
-"""The package's own."""
+"""The models of the package."""
 
 
 class Measured(NamedTuple):
-    """One program: what it took to build, and to run."""
+    """Build time, operations and run time of one program."""
 
     build: Build
     operations: int
@@ -65,7 +66,7 @@ class Measured(NamedTuple):
 
 
 class Work(NamedTuple):
-    """The same work for both: functions of parameters and data, to means and the likelihood."""
+    """The same work for both: functions from parameters and data to means and likelihood."""
 
     own: Callable[[Any, Any], tuple[Any, Array]]
     plain: Callable[[Any, Any], tuple[Any, Array]]
@@ -106,7 +107,7 @@ def _knots(model: Model, runs: int, count: int, time: np.ndarray) -> Knots | Non
 
 
 def _steps(model: Model, runs: int, count: int) -> Steps:
-    """Plausible input and samples near the start; their values do not change the work."""
+    """Plausible input and samples near the start; their values have no effect on the work."""
     shape = (runs, count, 1)
     time = np.broadcast_to(_DT * np.arange(count)[:, None], shape)
     dt = np.full(shape, _DT)
@@ -143,9 +144,9 @@ def _repeated(tree: Any, runs: int) -> Any:
 
 
 def work(name: str, runs: int, count: int) -> Work:
-    """So many runs of a contender, each of about `count` steps."""
+    """The work of `runs` runs of a model, each of about `count` steps."""
     if name == VISUAL:
-        # Recorded at 100 Hz.
+        # Its IMU has 100 Hz.
         one = landmarks.prepare(landmarks.recorded(count * _DT))
         model, params, belief = one.plain, one.params, one.belief
         steps = _repeated(one.steps, runs)
@@ -175,7 +176,7 @@ def work(name: str, runs: int, count: int) -> Work:
 
 
 def programs(made: Work, kinds: Sequence[str]) -> Iterator[tuple[str, str, Any, Any]]:
-    """Kind, whose, jitted function and data of each program of some work."""
+    """Kind, implementation, jitted function and data of each program of some work."""
     for kind in kinds:
         for whose, function, data in (
             (OWN, made.own, made.own_data),
@@ -196,16 +197,16 @@ def race(
     *,
     runs: int = RUNS,
     kinds: Sequence[str] = KINDS,
-    say: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> dict[str, dict[str, dict[str, Measured]]]:
-    """Both of each model, by name, kind and whose; they must agree."""
+    """Time both implementations of each model, by name, kind and implementation; they must agree."""
     found: dict[str, dict[str, dict[str, Measured]]] = {}
     for name in names:
         made, counted = work(name, runs, count), work(name, COUNTED, count)
         for (kind, whose, function, data), (*_, small, few) in zip(
             programs(made, kinds), programs(counted, kinds), strict=True
         ):
-            say(f"{name}, {kind}, {whose}")
+            report(f"{name}, {kind}, {whose}")
             built = build(function, made.params, data)
             time = timed(built.program, made.params, data, seconds=seconds)
             value = float(time.result[1] if kind == "forward" else time.result[0])

@@ -1,4 +1,4 @@
-"""The same work by other tools; each function gives one filter, compiled where the tool compiles."""
+"""The same problem with other packages, each as one filter function."""
 
 import importlib.util
 import os
@@ -20,7 +20,7 @@ from jaxekf import run_filter_batch
 YARDSTICK = Path(
     os.environ.get("JAXEKF_YARDSTICK", Path(__file__).parents[2] / "shared" / "yardstick")
 )
-"""Folder of the two C++ programs."""
+"""Folder of the sources of the two C++ programs."""
 Filter = Callable[[Noise, Any], tuple[Any, Any]]
 """``filter(noise, given)``: means (runs, T, 10) and the summed log-likelihood."""
 
@@ -31,7 +31,7 @@ def available(name: str) -> bool:
 
 
 def ours(noise: Noise, given: Any) -> tuple[Any, Any]:
-    """This project, as a user calls it, on all devices there are."""
+    """This package, on all devices."""
     runs = given.dt.shape[0]
     params = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), parameters(noise))
     devices = jax.devices() if len(jax.devices()) > 1 else ()
@@ -41,7 +41,7 @@ def ours(noise: Noise, given: Any) -> tuple[Any, Any]:
 
 
 def given_to_ours(z: np.ndarray) -> Any:
-    """The steps, each device holding its own runs."""
+    """The steps, with the runs distributed over the devices."""
     arrays = steps(z)
     if len(jax.devices()) == 1 or z.shape[0] < 2 * 16:
         return jax.tree.map(jnp.asarray, arrays)
@@ -52,7 +52,7 @@ def given_to_ours(z: np.ndarray) -> Any:
 
 
 def over_runs(one: Callable[[Noise, Any], tuple[Any, Any]]) -> Filter:
-    """A filter of one run, `vmap`ped."""
+    """A filter of one run, vectorised over runs by `vmap`."""
 
     def many(noise: Noise, z: Any) -> tuple[Any, Any]:
         mean, gained = jax.vmap(one, in_axes=(None, 0))(noise, z)
@@ -62,7 +62,7 @@ def over_runs(one: Callable[[Noise, Any], tuple[Any, Any]]) -> Filter:
 
 
 def textbook(noise: Noise, z: Any) -> tuple[Any, Any]:
-    """Plain JAX as a textbook has it: `jacfwd`, `@`, `cho_solve`, Joseph's form, in a scan."""
+    """Textbook JAX: `jacfwd`, `@`, `cho_solve`, Joseph's form, in a scan."""
     q, r = jnp.diag(noise.process), jnp.diag(noise.measurement)
 
     def step(carry: Any, given: Any) -> Any:
@@ -90,7 +90,7 @@ def textbook(noise: Noise, z: Any) -> tuple[Any, Any]:
 
 
 def dynamax(noise: Noise, z: Any) -> tuple[Any, Any]:
-    """dynamax's EKF; only the means are asked for."""
+    """dynamax's EKF; only the means are output."""
     from dynamax.nonlinear_gaussian_ssm import ParamsNLGSSM, extended_kalman_filter
 
     params = ParamsNLGSSM(
@@ -106,7 +106,7 @@ def dynamax(noise: Noise, z: Any) -> tuple[Any, Any]:
 
 
 def cuthbert(noise: Noise, z: Any) -> tuple[Any, Any]:
-    """cuthbert's linearised-moments filter, a square-root one."""
+    """cuthbert's square-root filter with linearised moments."""
     import cuthbert as package
     from cuthbert.gaussian import moments
 
@@ -129,7 +129,7 @@ def cuthbert(noise: Noise, z: Any) -> tuple[Any, Any]:
 
 
 def filterpy(noise: Noise, z: np.ndarray) -> tuple[np.ndarray, float]:
-    """filterpy's EKF, one run, in NumPy; the Jacobian is written by hand as its users do."""
+    """filterpy's EKF of one run, in NumPy, with a Jacobian derived by hand."""
     from filterpy.kalman import ExtendedKalmanFilter
 
     kf = ExtendedKalmanFilter(dim_x=10, dim_z=7)
@@ -152,7 +152,7 @@ def filterpy(noise: Noise, z: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _left(rate: np.ndarray) -> np.ndarray:
-    """Matrix that turns a quaternion by ``rate DT``."""
+    """Matrix (4, 4) that rotates a quaternion by ``rate DT``."""
     square = rate @ rate + 1e-30
     n = np.sqrt(square)
     c, s = np.cos(n * DT / 2), np.sin(n * DT / 2) / n
@@ -161,7 +161,7 @@ def _left(rate: np.ndarray) -> np.ndarray:
 
 
 def _jacobian(x: np.ndarray) -> np.ndarray:
-    """Eq. 17 of the source: derivative of the turned quaternion by quaternion and rate."""
+    """Derivative (10, 10) of the transition; eq. 17 of Cheng (2023) has its block for the rate."""
     q, rate = x[:4], x[4:7]
     f = np.eye(10)
     f[:4, :4] = _left(rate)
@@ -180,7 +180,7 @@ def _jacobian(x: np.ndarray) -> np.ndarray:
 
 
 def yardsticks() -> dict[str, float]:
-    """Microseconds per step and run of the two C++ programs, without those that cannot be built."""
+    """Microseconds per step and run of the C++ programs that can be built."""
     compiler = shutil.which("g++")
     if compiler is None or not YARDSTICK.is_dir():
         return {}

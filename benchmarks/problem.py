@@ -1,7 +1,7 @@
-"""The work that every filter of the race does: ten states, seven measured numbers, 2,000 steps.
+"""The problem that all filters of the benchmark solve: ten states, seven measurements, 2,000 steps.
 
-Cheng's model without the normalisation of the quaternion, which the peers have no place for: the turn by
-the rate, random walks, and additive errors; the same constants as the two C++ programs.
+It is Cheng's model without normalisation of the quaternion, which other packages do not support: rotation
+by the rate, random walks, and additive errors. The constants are those of the two C++ programs.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ MODEL: Model = replace(loose_additive.MODEL, name="race", project=None)
 
 
 class Noise(NamedTuple):
-    """What the gradient is taken to: all variances of Q and R."""
+    """The variances of Q and R, with respect to which the gradient is taken."""
 
     process: Any
     measurement: Any
@@ -35,7 +35,7 @@ NOISE = Noise(PROCESS, MEASUREMENT)
 
 
 def measurements(runs: int, steps: int = STEPS) -> np.ndarray:
-    """Quaternion and rate of a constant turn, with noise, (runs, steps, 7)."""
+    """Quaternion and rate of a rotation at a constant rate, with noise, (runs, steps, 7)."""
     rng = np.random.default_rng(1)
     angle = -np.deg2rad(9.0) * DT * np.arange(steps) / 2
     clean = np.zeros((steps, 7))
@@ -45,7 +45,7 @@ def measurements(runs: int, steps: int = STEPS) -> np.ndarray:
 
 
 def parameters(noise: Noise) -> Parameters:
-    """The variances as the model's own parameters."""
+    """The variances as parameters of the model."""
     density = jnp.sqrt(jnp.asarray(noise.process) / DT)
     sigma = jnp.sqrt(jnp.asarray(noise.measurement))
     own = loose_additive.Noise(density[:4], density[4:7], density[7:], sigma[:4], sigma[4:])
@@ -53,7 +53,7 @@ def parameters(noise: Noise) -> Parameters:
 
 
 def steps(z: np.ndarray) -> Steps:
-    """Measurements (runs, steps, 7) as the filter takes them; the first step lasts no time."""
+    """Measurements (runs, steps, 7) as steps of the filter; the first step has ``dt = 0``."""
     runs, count, _ = z.shape
     time = np.broadcast_to(DT * np.arange(count)[:, None], (runs, count, 1))
     dt = np.full((runs, count, 1), DT)
@@ -68,7 +68,7 @@ def steps(z: np.ndarray) -> Steps:
 
 
 def start(runs: int) -> Belief:
-    """The belief that every run starts from."""
+    """The initial belief of every run."""
     state = loose_additive.State(MEAN[:4], MEAN[4:7], MEAN[7:])
     belief = Belief(state, np.diag(VARIANCE))
 
@@ -79,7 +79,7 @@ def start(runs: int) -> Belief:
 
 
 def turn(x: Any, dt: Any) -> Any:
-    """The transition in plain JAX, for the peers: ``exp(rate dt) q``."""
+    """The transition in plain JAX, for the other packages: ``exp(rate dt) q``."""
     q, rate = x[:4], x[4:7]
     square = rate @ rate * dt**2 + 1e-30
     angle = jnp.sqrt(square)

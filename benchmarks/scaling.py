@@ -1,8 +1,8 @@
-"""Time and memory against run length, runs and state size: ``python benchmarks/scaling.py [--quick]``.
+"""Time and memory over run length, runs and state size: ``python benchmarks/scaling.py [--quick]``.
 
-Every point is a process of its own on one CPU device, so that its peak memory is its own. Prints a table,
-the slopes on logarithmic axes, what an hour at 200 Hz costs with and without recomputation, and last one
-line of JSON; writes a figure (``-o``, by default scaling.png). ``--smoke`` takes three tiny points.
+Every point is measured in its own process on one CPU device, so that its peak memory is known. Prints a
+table, the slopes on logarithmic axes, time and memory of one hour at 200 Hz with and without recomputation
+of beliefs, and JSON as the last line; writes a figure (``-o``). ``--smoke`` has three tiny points.
 """
 
 import argparse
@@ -28,7 +28,7 @@ _KINDS = ("forward", "gradient")
 
 @dataclass(frozen=True)
 class Point:
-    """One measurement: what is run, and what it cost."""
+    """One point: its size, and its measured time and memory."""
 
     sweep: str
     kind: str
@@ -70,7 +70,7 @@ def points(quick: bool, smoke: bool) -> list[Point]:
 
 
 def _chain(size: int) -> tuple[Any, Any, Any]:
-    """A model of `size` states: parts of three that each drive the one before, two of them measured."""
+    """A model of `size` states: blocks of three, each the rate of the one before; two are measured."""
     import jax.numpy as jnp
 
     from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
@@ -95,7 +95,7 @@ def _chain(size: int) -> tuple[Any, Any, Any]:
 
     model = Model(
         name="chain",
-        summary="parts that drive each other",
+        summary="a chain of blocks of three states",
         space=(Euclidean(3),) * count,
         transition=transition,
         process_noise=lambda params, dt: params.noise**2 * dt * jnp.eye(size),
@@ -132,7 +132,7 @@ def _chain(size: int) -> tuple[Any, Any, Any]:
 
 
 def measure(point: Point) -> Point:
-    """The point with its cost; to be called once in a process."""
+    """Measure time and memory of a point; call it once in a process."""
     import jax
     import jax.numpy as jnp
     import problem
@@ -177,7 +177,7 @@ def measure(point: Point) -> Point:
 
 
 def _resident() -> float:
-    """The most memory that this process has held, MiB."""
+    """Peak memory of this process, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -185,7 +185,7 @@ def _resident() -> float:
 
 
 def in_a_process(point: Point) -> Point:
-    """The point measured by a process of its own."""
+    """Measure a point in its own process."""
     given = json.dumps(vars(point))
     found = subprocess.run(
         [sys.executable, __file__, "--point", given], check=True, capture_output=True, text=True
@@ -194,23 +194,23 @@ def in_a_process(point: Point) -> Point:
 
 
 def slope(found: list[Point], quantity: str, knee: int) -> float:
-    """The exponent of a power law through the points at or past the knee."""
+    """The exponent of a power law fitted to the points at or above the size `knee`."""
     past = [p for p in found if p.size >= knee]
     values = [getattr(p, quantity) for p in past]
     return float(np.polyfit(np.log([p.size for p in past]), np.log(values), 1)[0])
 
 
 _KNEE = {"run length": 1_000, "runs": 16, "state size": 6}
-"""From where on a sweep is fitted: a call's fixed cost paid off; lanes filled."""
+"""Smallest size in the fit of each sweep; below it, fixed costs and unused vector lanes dominate."""
 
 
 def main() -> None:
-    """Measure, print and draw."""
+    """Measure all points, print the results and draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer points, no hour")
+    parser.add_argument("--quick", action="store_true", help="fewer points, without the hour")
     parser.add_argument("--smoke", action="store_true", help="three tiny points")
     parser.add_argument(
-        "-o", "--output", default="scaling.png", help="the figure (scaling.png); none with --smoke"
+        "-o", "--output", default="scaling.png", help="figure (scaling.png); none with --smoke"
     )
     parser.add_argument("--point", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -245,20 +245,20 @@ def main() -> None:
 
 
 def an_hour() -> dict[str, float]:
-    """The gradient over an hour at 200 Hz, with beliefs computed again and with all kept."""
+    """Time and memory of the gradient over an hour at 200 Hz, with recomputed and with stored beliefs."""
     again = in_a_process(Point("run length", "gradient", 10, 1, _HOUR))
     kept = in_a_process(Point("run length", "gradient", 10, 1, _HOUR, checkpoint=False))
     return {
         f"gradient over {_HOUR:,} steps, s": again.seconds,
         "peak memory, MiB": again.peak_mib,
-        "the same with all beliefs kept, s": kept.seconds,
+        "the same with stored beliefs, s": kept.seconds,
         "its peak memory, MiB": kept.peak_mib,
         "ratio of times": again.seconds / kept.seconds,
     }
 
 
 def show(console: Any, found: list[Point]) -> None:
-    """The table."""
+    """Print the table of points."""
     from rich.table import Table
 
     table = Table(title="one CPU device, float64")
@@ -272,7 +272,7 @@ def show(console: Any, found: list[Point]) -> None:
 
 
 def draw(found: list[Point], slopes: dict[str, float], path: Path) -> None:
-    """Time and memory against each of the three sizes."""
+    """Draw time and memory over each of the three sizes."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -302,8 +302,10 @@ def draw(found: list[Point], slopes: dict[str, float], path: Path) -> None:
             axis.grid(True, which="both", alpha=0.3)
             axis.legend()
     axes[0, 0].set_ylabel("time of one call (ms)")
-    axes[1, 0].set_ylabel("peak memory above the start, with compiler (MiB)")
-    figure.suptitle("10-state model unless said; one CPU device, float64; fitted past the knee")
+    axes[1, 0].set_ylabel("additional peak memory with compilation (MiB)")
+    figure.suptitle(
+        "10-state model unless stated otherwise; one CPU device, float64; slopes of large sizes"
+    )
     with whole_file(path, overwrite=True) as made:
         figure.savefig(made, dpi=120)
 

@@ -1,10 +1,10 @@
-"""Gradient search against searches without gradients: ``python benchmarks/searches.py [--quick]``.
+"""Gradient search compared with derivative-free searches: ``python benchmarks/searches.py [--quick]``.
 
-Finds 18 numbers, the full 3 x 3 factors of the three noises of `loose`, on simulated runs whose noise is
-correlated between axes, from a start that is off by factors of 3 to 10. Work is counted in forward
-equivalents: evaluations of the objective, of which one with its gradient counts as many as it takes the
-time of, measured in the same process. Times a whole tuning of ten runs too. Prints tables and, last, one
-line of JSON. ``--smoke`` takes one short run, one objective and one iteration.
+Each search finds 18 numbers, the full 3 x 3 factors of the three noises of `loose`, from simulated runs
+with noise that is correlated between axes; the start is wrong by factors of 3 to 10. The unit of work is
+one evaluation of the objective; one with gradient counts by its measured time. Also times a complete tuning
+of ten runs. Prints tables and, as the last line, JSON. ``--smoke`` has one short run, one objective and one
+iteration.
 """
 
 import argparse
@@ -40,16 +40,16 @@ from jaxekf.simulation import attitude_runs
 from tuning.search import evaluation
 
 GYROSCOPE_DEG = np.array([[0.05, 0.0, 0.0], [0.03, 0.06, 0.0], [-0.02, 0.01, 0.03]])
-"""Factor of the gyroscope's density, deg/s/sqrt(Hz)."""
+"""Factor of the covariance of the gyroscope's white noise, deg/s/sqrt(Hz)."""
 OPTICAL_DEG = np.array([[0.2, 0.0, 0.0], [0.15, 0.3, 0.0], [0.1, -0.1, 0.4]])
 """Factor of the tracker's covariance, deg."""
 FACTORS = {"gyroscope": 10.0, "bias_walk": 3.0, "optical": 0.2}
-"""By which the start is off, of each axis's deviation."""
+"""Factors between start and truth of the standard deviations of each axis."""
 SWEEPS = 20
 
 
 def correlated(seed: int, duration_s: float) -> Recording:
-    """A run whose noise is correlated between axes."""
+    """Simulate a run with noise that is correlated between axes."""
     grade = attitude_runs.SensorGrade(gyroscope_deg=0.0, optical_deg=0.0)
     motion = attitude_runs.free_motion(seed, rest_s=0.5)
     hidden = [(t, t + 1.0) for t in np.arange(5.0, duration_s, 8.0)]
@@ -67,7 +67,7 @@ def correlated(seed: int, duration_s: float) -> Recording:
 
 
 def start_off(model: Any) -> Any:
-    """The planted deviations of each axis, off by `FACTORS`, without correlation."""
+    """The true standard deviations of each axis times `FACTORS`, without correlation."""
     each = {
         "gyroscope": np.sqrt(np.diag(GYROSCOPE_DEG @ GYROSCOPE_DEG.T)),
         "bias_walk": np.full(3, attitude_runs.SensorGrade().bias_walk_deg),
@@ -79,7 +79,7 @@ def start_off(model: Any) -> Any:
 
 
 def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: float) -> float:
-    """How many times as long the objective takes with its gradient."""
+    """The time of the objective with its gradient, relative to that without."""
     aim = tuned.objective
     groups = tuning.objective.data.prepare_groups(model, runs, need_truth=aim.needs_truth)
     counts = evaluation.total_counts(groups, aim)
@@ -97,7 +97,7 @@ def ratio(model: Any, runs: Sequence[Recording], tuned: tuning.Tuned, seconds: f
 def race(
     runs: Sequence[Recording], objective: str, quick: bool, smoke: bool = False
 ) -> dict[str, Any]:
-    """The three searches from the same start: work to reach what coordinate search ends with."""
+    """Run the three searches from the same start: work to reach the final value of coordinate search."""
     model = jaxekf.get_model("loose")
     given: dict[str, Any] = {"model": model, "objective": objective, "axes": "full"}
     given["start"] = start_off(model)
@@ -138,7 +138,7 @@ def race(
 
 
 def show(found: dict[str, Any]) -> None:
-    """One objective as a table."""
+    """Print the results of one objective as a table."""
     title = (
         f"{found['objective']}: {found['start']:.5g} at the start; value with gradient takes"
         f" {found['gradient costs']:.2f} times a value"
@@ -159,7 +159,7 @@ def show(found: dict[str, Any]) -> None:
 
 
 def whole_tuning(count: int, duration_s: float, **how: Any) -> dict[str, Any]:
-    """Seconds of a tuning of noise and calibration from runs in memory, compiling included."""
+    """Time a tuning of noise and calibration, with compilation."""
     grade = attitude_runs.SensorGrade(imu_hz=200.0)
     matrix = np.array([[1.01, 0.004, -0.006], [-0.003, 0.99, 0.005], [0.002, -0.004, 1.005]])
     runs = []
@@ -199,13 +199,13 @@ def whole_tuning(count: int, duration_s: float, **how: Any) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run it."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs and searches")
-    parser.add_argument("--smoke", action="store_true", help="one iteration, to see that it ends")
+    parser.add_argument("--smoke", action="store_true", help="one iteration on one short run")
     arguments = parser.parse_args()
     quick, smoke = arguments.quick, arguments.smoke
-    # First, so that nothing of it is compiled yet.
+    # First, so that its compilation is part of the time.
     size = (2, 6.0) if quick else (10, 60.0)
     if smoke:
         whole = [

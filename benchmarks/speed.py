@@ -1,14 +1,14 @@
-"""Race of filters on the same work: ``python benchmarks/speed.py [--quick] [--models marg triad]``.
+"""Speed of filters of the same problem: ``python benchmarks/speed.py [--quick] [--models marg triad]``.
 
-Prints microseconds per step and run (medians), the first-call seconds and the peak memory of filters of ten
-states; then, for each model of the package against the same model in textbook JAX, the operations of the
-program, the seconds that tracing, lowering and compiling take, and the run time. Build times are those of
-programs of 64 runs, built once each from nothing, without programs kept on disk; operations are lines with
-``=`` of the StableHLO text for 16 runs. All filters must agree. Two CPU devices.
+Prints median microseconds per step and run, seconds of the first call, and peak memory of filters with ten
+states; then for each model of the package, compared with the same model in textbook JAX, the number of
+operations, the seconds of tracing, lowering and compilation, and the run time. Build times are those of
+programs for 64 runs, without caches; operations are lines with ``=`` in the StableHLO text for 16 runs. All
+filters must agree. There are two CPU devices.
 
-The last line is JSON. ``limit_ratio`` compares ten states and 64 runs with C++ of 8 runs per vector on two
-threads (null where that cannot be built), and the gradient with the forward pass. ``build_ratio`` is
-the gradient's build time over that of textbook JAX's gradient.
+The last line is JSON. ``limit_ratio`` compares ten states and 64 runs with C++ with 8 runs per vector on
+two threads (null if that cannot be built), and the gradient with the forward pass. ``build_ratio`` is the
+build time of the gradient relative to that of textbook JAX.
 """
 
 import argparse
@@ -43,32 +43,32 @@ from rich.console import Console
 from rich.table import Table
 
 OURS = "jaxekf"
-"""Compiled by `jaxekf.jit`, as `estimate` and `tune` are."""
+"""This package, compiled by `jaxekf.jit` as in `estimate` and `tune`."""
 PLAIN = "jaxekf, plain jax.jit"
 TEXTBOOK = "textbook JAX"
 PEERS = ("dynamax", "cuthbert")
 RACE = "race"
-"""Name of the model of ten states."""
+"""Name of the model with ten states."""
 TWO_THREADS = "C++ vectors, 2 thread(s)"
 Times = dict[str, dict[str, float]]
 Programs = dict[str, dict[str, dict[str, Measured]]]
 
 
 class Size(NamedTuple):
-    """How much is measured."""
+    """Sizes of the measurements."""
 
     runs: tuple[int, ...]
     steps: int
-    """Of a run of ten states."""
+    """Steps of a run with ten states."""
     seconds: float
-    """For which each program is timed."""
+    """Duration of the timing of each program."""
     models: tuple[str, ...]
     model_steps: int
-    """Of a run of another model."""
+    """Steps of a run of another model."""
     model_runs: int
     model_kinds: tuple[str, ...] = KINDS
     gradients: tuple[str, ...] = (OURS, PLAIN, TEXTBOOK, *PEERS)
-    """Filters of ten states whose gradient is taken."""
+    """Filters with ten states whose gradient is timed."""
 
 
 FULL = Size((1, 64, 1024), STEPS, 3.0, tuple(models.CONTENDERS), 500, models.RUNS)
@@ -79,22 +79,22 @@ SMOKE = Size((2,), 30, 0.0, ("loose",), 30, 2, ("forward",), (OURS, TEXTBOOK))
 
 
 class Contender(NamedTuple):
-    """A filter of many runs, and how it is compiled and fed."""
+    """A filter of many runs, with the functions that make its input and compile it."""
 
     run: peers.Filter
     give: Callable[[np.ndarray], Any]
-    """Makes its input of the measurements."""
+    """Converts measurements into its input."""
     jit: Callable[..., Any]
 
     def function(self, kind: str) -> Any:
-        """Means and likelihood, or the likelihood with its gradient to all of Q and R; not built yet."""
+        """The jitted function: means and likelihood, or likelihood and gradient with respect to Q and R."""
         if kind == "forward":
             return self.jit(self.run)
         return self.jit(jax.value_and_grad(lambda noise, given: self.run(noise, given)[1]))
 
 
 def contenders() -> dict[str, Contender]:
-    """Those that are installed, by name."""
+    """The installed filters by name."""
     found = {
         OURS: Contender(peers.ours, peers.given_to_ours, jaxekf.jit),
         PLAIN: Contender(peers.ours, peers.given_to_ours, jax.jit),
@@ -108,7 +108,7 @@ def contenders() -> dict[str, Contender]:
 
 
 def agree(kind: str, results: dict[str, Any]) -> None:
-    """Raise unless all filters gave the same means and likelihood, or gradients."""
+    """Raise unless all filters have the same means and likelihood, or gradients."""
     if kind == "gradient":
         slopes = {name: np.concatenate(slope) for name, (_, slope) in results.items()}
         for name, slope in slopes.items():
@@ -117,25 +117,25 @@ def agree(kind: str, results: dict[str, Any]) -> None:
         return
     mean, total = results[OURS]
     for name, (other, likelihood) in results.items():
-        # dynamax adds 1e-9 to the diagonal of S before it solves, and so differs by that much.
+        # dynamax adds 1e-9 to the diagonal of S, and so differs by that much.
         loose = name == "dynamax"
         np.testing.assert_allclose(other, mean, rtol=0, atol=2e-5 if loose else 1e-8, err_msg=name)
         np.testing.assert_allclose(likelihood, total, rtol=1e-3 if loose else 1e-7, err_msg=name)
 
 
 class Race(NamedTuple):
-    """The filters of ten states."""
+    """Times of the filters with ten states."""
 
     us: Times
     """Microseconds per step and run, by filter and column."""
     first_s: Times
-    """Seconds of the first call, building included."""
+    """Seconds of the first call, with compilation."""
     builds: dict[str, dict[str, Build]]
     """Builds of the largest gradient and its forward pass, by kind and filter."""
 
 
-def race(size: Size, say: Callable[[str], None]) -> Race:
-    """Build, compare and time the filters of ten states."""
+def race(size: Size, report: Callable[[str], None]) -> Race:
+    """Build, compare and time the filters with ten states."""
     found = Race({}, {}, {})
     most = max([runs for runs in size.runs if runs < 1024])
     for runs in size.runs:
@@ -147,7 +147,7 @@ def race(size: Size, say: Callable[[str], None]) -> Race:
                     continue
                 if kind == "gradient" and name not in size.gradients:
                     continue
-                say(f"{name}, {column}")
+                report(f"{name}, {column}")
                 given, noise = one.give(z), Noise(*NOISE)
                 built = build(one.function(kind), noise, given)
                 begin, median, result = timed(built.program, noise, given, seconds=size.seconds)
@@ -163,7 +163,7 @@ def race(size: Size, say: Callable[[str], None]) -> Race:
 
 
 def by_filterpy(z: np.ndarray, column: str, us: Times) -> tuple[np.ndarray, float]:
-    """Means and likelihood of filterpy, one run after the other."""
+    """Means and likelihood of filterpy, run by run."""
     begin = time.perf_counter()
     found = [peers.filterpy(NOISE, one) for one in z]
     us["filterpy"] = {column: (time.perf_counter() - begin) / z[..., 0].size * 1e6}
@@ -171,7 +171,7 @@ def by_filterpy(z: np.ndarray, column: str, us: Times) -> tuple[np.ndarray, floa
 
 
 def of_ten_states(made: Race, size: Size) -> dict[str, dict[str, Measured]]:
-    """The race's own model as one of the models, by kind and whose."""
+    """The results of the model with ten states in the form of the other models."""
     column = max([runs for runs in size.runs if runs < 1024])
     z = measurements(models.COUNTED, size.steps)
     found: dict[str, dict[str, Measured]] = {}
@@ -187,7 +187,7 @@ def of_ten_states(made: Race, size: Size) -> dict[str, dict[str, Measured]]:
 
 
 def ratios(speed: Times) -> dict[str, float]:
-    """The project's own aims, from the same run of the script."""
+    """Ratios of times within this run of the script."""
     own = speed[OURS]
     found = {
         f"gradient / forward, 64 runs, {name}": speed[name]["64 gradient"]
@@ -209,7 +209,7 @@ def ratios(speed: Times) -> dict[str, float]:
 
 
 def limit_ratio(speed: Times) -> dict[str, float | None]:
-    """Ten states, 64 runs, two devices: against C++ on two threads, and gradient against forward."""
+    """Ten states, 64 runs, two devices: time relative to C++ on two threads, and gradient to forward."""
     own = speed[OURS]
     forward, gradient = own.get("64 forward"), own.get("64 gradient")
     limit = speed.get(TWO_THREADS, {}).get("1024 forward")
@@ -220,7 +220,7 @@ def limit_ratio(speed: Times) -> dict[str, float | None]:
 
 
 def of_programs(found: Programs) -> dict[str, Any]:
-    """The programs for the line of JSON."""
+    """The results of the programs for the line of JSON."""
 
     def each(whose: str, value: Callable[[Measured], float]) -> dict[str, dict[str, float]]:
         return {
@@ -250,7 +250,7 @@ def of_programs(found: Programs) -> dict[str, Any]:
 
 
 def show(console: Console, made: Race) -> None:
-    """The table of filters of ten states."""
+    """Print the table of filters with ten states."""
     columns = list(made.us[OURS])
     table = Table(title="ten states: microseconds per step and run (first call, s)")
     table.add_column("filter")
@@ -267,9 +267,9 @@ def show(console: Console, made: Race) -> None:
 
 
 def show_models(console: Console, found: Programs, runs: int) -> None:
-    """The table of all models: operations, stages of the build, and run time, of both."""
+    """Print the table of all models: operations, build times and run times of both implementations."""
     table = Table(
-        title=f"models beside textbook JAX: operations ({models.COUNTED} runs); trace + lower + compile, s,"
+        title=f"models and textbook JAX: operations ({models.COUNTED} runs); trace + lower + compile, s,"
         f" and microseconds per step and run ({runs} runs)"
     )
     columns = ("operations", "build, s", "us")
@@ -291,7 +291,7 @@ def show_models(console: Console, found: Programs, runs: int) -> None:
 
 
 def processor() -> str:
-    """Name of the processor, where Linux gives it."""
+    """Name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -303,37 +303,37 @@ def parse_arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer runs, shorter timing")
-    parser.add_argument("--smoke", action="store_true", help="tiny sizes, to see that it ends")
+    parser.add_argument("--smoke", action="store_true", help="tiny sizes")
     parser.add_argument(
         "--models",
         nargs="+",
         choices=list(models.CONTENDERS),
-        help="these models alone, against textbook JAX (all)",
+        help="only these models, compared with textbook JAX (all)",
     )
     return parser.parse_args()
 
 
 def race_models(
-    names: Sequence[str], size: Size, found: Programs, say: Callable[[str], None]
+    names: Sequence[str], size: Size, found: Programs, report: Callable[[str], None]
 ) -> None:
-    """Add the models to what was found."""
+    """Add the results of these models to `found`."""
     found |= models.race(
         names,
         size.seconds,
         size.model_steps,
         runs=size.model_runs,
         kinds=size.model_kinds,
-        say=say,
+        report=report,
     )
 
 
 def main() -> None:
-    """Run the race."""
+    """Run the benchmark."""
     arguments = parse_arguments()
     size = SMOKE if arguments.smoke else QUICK if arguments.quick else FULL
     console, began = Console(width=140), time.perf_counter()
     found: Programs = {}
-    # The first program that is compiled starts the compiler.
+    # The first compilation starts the compiler; it is not part of the times.
     jax.block_until_ready(jax.jit(lambda x: x + 1)(1.0))
     with Console(stderr=True).status("") as status:
         if arguments.models:
@@ -359,12 +359,14 @@ def main() -> None:
         for name in models.CONTENDERS:
             models.work(name, size.model_runs, size.model_steps)
     show_models(console, found, size.model_runs)
-    print("all agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)")
+    print(
+        "all filters agree: means within 1e-8 (dynamax, whose solver adds 1e-9 to S, within 2e-5)"
+    )
     limits = {f"limit ratio, {name}": value for name, value in limit_ratio(made.us).items()}
     for name, value in (ratios(made.us) | limits).items():
         print(f"{name}: {value}")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"peak memory of the whole race: {peak:.0f} MiB")
+    print(f"peak memory of the whole benchmark: {peak:.0f} MiB")
     result = {
         **where,
         "us_per_step_per_run": made.us,

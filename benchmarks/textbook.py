@@ -1,6 +1,6 @@
-"""The steps of an extended Kalman filter as a textbook has them, in plain JAX: `jacfwd`, `@`, `cho_solve`.
+"""The steps of an extended Kalman filter as in a textbook, in plain JAX: `jacfwd`, `@`, `cho_solve`.
 
-They take the package's models, and nothing else of it that computes.
+They use the package's models, but none of its filter.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from jaxekf.geometry import manifold
 
 
 def predict(model: Model, params: Parameters, belief: Belief, u: Any, dt: Array) -> Belief:
-    """The belief a step later."""
+    """The predicted belief after a step."""
     x, p = belief
     q = model.process_noise(params, dt)
     still = jnp.zeros(q.shape[0])
@@ -32,7 +32,7 @@ def predict(model: Model, params: Parameters, belief: Belief, u: Any, dt: Array)
 def linearise(
     model: Model, params: Parameters, x: Any, u: Any, samples: dict[str, Rows]
 ) -> tuple[Array, Array, Array]:
-    """Slopes, innovations and noise of all rows of all samples of an instant, masked or not."""
+    """Jacobian, innovations and noise of all rows of all samples of an instant, also the masked ones."""
     slopes, errors, noises = [], [], []
     for name, rows in samples.items():
         sensor = model.sensor(name)
@@ -53,7 +53,7 @@ def linearise(
 def correct(
     model: Model, belief: Belief, h: Array, e: Array, r: Array, count: Any
 ) -> tuple[Belief, Array]:
-    """The belief after so many rows that count, in Joseph's form, and their log-likelihood."""
+    """The updated belief in Joseph's form, and the log-likelihood of its `count` unmasked rows."""
     x, p = belief
     s = h @ p @ h.T + r
     factor = jax.scipy.linalg.cho_factor(s, lower=True)

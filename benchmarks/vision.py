@@ -1,9 +1,9 @@
 """Time of the visual-inertial filter with 30 correspondences in an image: ``python benchmarks/vision.py``.
 
-One run, everything on one core. Beside the filter, its smoother and the gradient of the likelihood to all
-parameters is the same filter in textbook JAX (Jacobians by `jacfwd`, all rows in one Cholesky factor,
-under `lax.cond`), which must agree. Prints a table, and last one line of JSON. ``--smoke`` takes the filter
-alone on half a second.
+Times of one run on one core: the filter, the smoother, the gradient of the likelihood with respect to all
+parameters, and the same filter in textbook JAX (Jacobians by `jacfwd`, all rows in one Cholesky factor,
+under `lax.cond`), which must agree. Prints a table and, as the last line, JSON. ``--smoke`` times only the
+filter on half a second.
 """
 
 import argparse
@@ -35,7 +35,7 @@ PLAIN, TEXTBOOK = "filter without gates", "textbook JAX without gates"
 
 
 def work(one: Prepared) -> dict[str, Any]:
-    """Each function that is timed, by name; those of textbook JAX take other steps."""
+    """The timed functions by name; those of textbook JAX have other steps."""
 
     def smoothed(free: Any, steps: Steps) -> Any:
         params = free._replace(setup=one.params.setup)
@@ -53,7 +53,7 @@ def work(one: Prepared) -> dict[str, Any]:
 
 
 def race(run: Recording, least_s: float, *, smoke: bool) -> dict[str, tuple[float, float]]:
-    """Seconds of the first call of each, and of one like it later."""
+    """Seconds of the first call and median seconds of later calls of each function."""
     one = prepare(run)
     chosen = work(one)
     if smoke:
@@ -73,13 +73,11 @@ def race(run: Recording, least_s: float, *, smoke: bool) -> dict[str, tuple[floa
 
 
 def main() -> None:
-    """Race, check that the filters agree, and print the times."""
+    """Time the filters, check that they agree, and print the times."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the run, s (60)")
     parser.add_argument("--timing", type=float, default=3.0, help="time for each function, s (3)")
-    parser.add_argument(
-        "--smoke", action="store_true", help="filter alone, half a second, 6 points"
-    )
+    parser.add_argument("--smoke", action="store_true", help="filter only, half a second, 6 points")
     arguments = parser.parse_args()
     seconds, least_s, points = arguments.seconds, arguments.timing, POINTS
     if arguments.smoke:

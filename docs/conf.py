@@ -13,10 +13,9 @@ os.environ.setdefault("JAXEKF_COMPILE", "quick")
 # XLA logs lines of three kilobytes for programs read from a cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+import _streams  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 from sphinx.ext.napoleon.docstring import NumpyDocstring  # noqa: E402
-
-import _streams  # noqa: E402
 
 import jaxekf  # noqa: E402
 

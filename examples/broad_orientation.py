@@ -1,19 +1,20 @@
-"""Orientation from gyroscope, accelerometer and magnetometer of BROAD trials, tuned, beside other filters.
+"""Orientation from gyroscope, accelerometer and magnetometer of BROAD trials, compared with other filters.
 
     python examples/broad_orientation.py DIR --train 01 05 10 16 28 32 --test 02 07 12 24 35
 
-DIR holds BROAD's MATLAB files. The model `marg` is tuned by gradient on the training trials alone, against
-their motion capture, and estimates the test trials, filtered and smoothed. Beside it stand VQF and its
-offline form (from PyPI), and Madgwick's and Mahony's filters (from `ahrs`, gains tuned on the training
-trials too):
+DIR is the folder of BROAD's MATLAB files. The model `marg` is tuned by gradient on the training trials,
+with their motion capture as truth; it then estimates the test trials, filtered and smoothed. It is
+compared with VQF and its offline form, and with Madgwick's and Mahony's filters (from `ahrs`, with gains
+tuned on the training trials):
 
     pip install "jaxekf[bench]"
 
-Errors are BROAD's: root mean squares over the samples of `movement` of the whole angle between estimate and
-truth, of its turn about the vertical (heading) and of the rest (inclination); no heading offset is removed.
-Frames were checked against the truth: Madgwick's filter of `ahrs` gives north, west, up, all others east,
-north, up. The last line printed is JSON: means over the test trials, and each trial's. Filters that are not
-installed are left out. `--smoke` filters a short piece of one trial with the defaults.
+The errors are those of BROAD: RMS over the samples of `movement` of the total angle between estimate and
+truth, of its rotation about the vertical (heading) and of the remaining rotation (inclination); no heading
+offset is removed. The reference frame of Madgwick's filter in `ahrs` is north, west, up, that of the others
+east, north, up. The last line of the output is JSON with the means over the test trials and the error of
+each trial. Filters that are not installed are left out. `--smoke` filters a short piece of one trial with
+the default noise.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from importlib.util import find_spec
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
-# The tuned filter is compiled in a third of the time so, and what runs then takes seconds.
+# Compilation takes a third of the time with this setting, and the filter runs only for seconds.
 os.environ.setdefault("JAXEKF_COMPILE", "quick")
 
 import jax
@@ -51,31 +52,30 @@ from jaxekf.evaluation.metrics import OrientationError, orientation_error
 from jaxekf.io.importers import broad
 from jaxekf.models import marg
 from jaxekf.recordings.truth import encoder_at
-from jaxekf.recordings.types import Floats, Imu, Times, to_scipy
+from jaxekf.recordings.types import Floats, Times, to_scipy
 from tuning.objective.data import prepare_groups
 from tuning.objective.objectives import visible_rows
 
 ITERATIONS = 12
 CONSOLE = Console(stderr=True)
 COARSE = 6
-"""Samples of a training trial that are averaged: a sixth of the work, and the tuned densities do not depend
-on the rate."""
+"""Samples of a training trial that are averaged to one: less work, and noise densities do not depend on the
+sample rate."""
 DOUBT = 0.7
-"""Standard deviation of what is known beforehand of each density, as a logarithm: the defaults are right
-within a factor of two."""
+"""Prior standard deviation of the logarithm of each density: a factor of two about the default."""
 INDEPENDENT = 10
-"""How many errors that tell something new the training trials hold: heading is wrong for minutes at a time.
-Against so few the defaults count, and noise that suits only these trials is not found."""
+"""Effective number of independent errors in the training trials, since heading errors last for minutes. It
+determines the weight of the prior, which prevents overfitting to these trials."""
 MADGWICK = (0.01, 0.02, 0.05, 0.1, 0.2)
 MAHONY = (0.05, 0.1, 0.25, 0.5, 1.0)
 SHARES = (0.001, 0.03, 0.3)
-"""Mahony's gains of the integral, as shares of the proportional ones; the package takes no 0."""
+"""Mahony's integral gains relative to the proportional ones; the package does not accept 0."""
 NORTH_WEST_UP = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-"""From north, west, up to east, north, up."""
+"""Rotation from north, west, up to east, north, up."""
 
 
 class Gains(NamedTuple):
-    """Of a filter of `ahrs`."""
+    """Gains of a filter of `ahrs`."""
 
     kind: str
     proportional: float
@@ -83,11 +83,11 @@ class Gains(NamedTuple):
 
 
 # ---------------------------------------------------------------------------------------------
-# Ours
+# This package
 
 
 def coarse(trial: jaxekf.Recording) -> jaxekf.Recording:
-    """A trial whose IMU is averaged over `COARSE` samples; a field that turns is taken from the middle."""
+    """A trial with the IMU averaged over `COARSE` samples; the magnetic field is the middle sample."""
     imu = trial.need_imu()
     count = len(imu.time_ns) // COARSE
     middle = np.arange(count) * COARSE + COARSE // 2
@@ -100,20 +100,22 @@ def coarse(trial: jaxekf.Recording) -> jaxekf.Recording:
     gyroscope = mean(imu.gyroscope)
     assert gyroscope is not None and imu.magnetometer is not None
     field = imu.magnetometer[middle]
-    return trial.replace(imu=Imu(imu.time_ns[middle], gyroscope, mean(imu.accelerometer), field))
+    return trial.replace(
+        imu=jaxekf.Imu(imu.time_ns[middle], gyroscope, mean(imu.accelerometer), field)
+    )
 
 
 def start_for(trials: Sequence[jaxekf.Recording]) -> jaxekf.Parameters:
-    """The defaults, with the clock at which the trials' motion capture and gyroscope agree."""
+    """The default parameters, with the clock offset between motion capture and gyroscope of the trials."""
     lags = [time_offset.match(t.need_optical(), t.need_imu(), t.name).latency_s for t in trials]
     calibration = marg.DEFAULTS.calibration._replace(clock_offset=np.array(-np.median(lags)))
     return marg.DEFAULTS._replace(calibration=calibration)
 
 
 def tuned_on(trials: Sequence[jaxekf.Recording], iterations: int) -> tuning.Tuned:
-    """The noise that gives the filter the least error of attitude, with a prior about the defaults."""
+    """Noise with the least attitude error of the filter, with a prior about the defaults."""
     learning = [coarse(trial) for trial in trials]
-    # The prior counts as so many more measured rows, beside which the mean error stands.
+    # The objective weighs the prior by a number of rows.
     rows = sum(int(visible_rows(data)) for data in prepare_groups(marg.MODEL, learning))
     objective = tuning.Objective((("attitude", 1.0),), prior=rows / INDEPENDENT)
 
@@ -135,11 +137,11 @@ def tuned_on(trials: Sequence[jaxekf.Recording], iterations: int) -> tuning.Tune
 
 
 # ---------------------------------------------------------------------------------------------
-# The others
+# Other filters
 
 
-def vqf(imu: Imu, *, offline: bool) -> Floats:
-    """Quaternions (N, 4) of VQF (Laidig and Seel 2023), filtered or offline; its default parameters."""
+def vqf(imu: jaxekf.Imu, *, offline: bool) -> Floats:
+    """Quaternions (N, 4) of VQF (Laidig and Seel 2023) with default parameters, filtered or offline."""
     package = import_module("vqf")
     streams = [
         np.ascontiguousarray(a) for a in (imu.gyroscope, imu.accelerometer, imu.magnetometer)
@@ -151,14 +153,14 @@ def vqf(imu: Imu, *, offline: bool) -> Floats:
 
 
 def start_of(trial: jaxekf.Recording) -> Floats:
-    """The attitude (4,) that our own filter starts from, for all."""
+    """Initial attitude (4,) of this package's filter, used for all filters."""
     found = marg.find_start(trial, {"magnetometer": marg.magnetometer(trial)})
     assert found is not None
     return np.asarray(found.first["q_ref_body"])
 
 
-def by_ahrs(gains: Gains, imu: Imu, start: Floats) -> Floats:
-    """Quaternions (N, 4), east, north, up, of a filter of `ahrs` from the attitude (4,) it starts at."""
+def by_ahrs(gains: Gains, imu: jaxekf.Imu, start: Floats) -> Floats:
+    """Quaternions (N, 4), to east, north, up, of a filter of `ahrs` with the initial attitude (4,)."""
     filters = import_module("ahrs.filters")
     rate = 1e9 / float(np.mean(np.diff(imu.time_ns)))
     if gains.kind == "madgwick":
@@ -184,26 +186,30 @@ def product(p: Floats, q: Floats) -> Floats:
     return (to_scipy(p) * to_scipy(q)).as_quat(scalar_first=True)
 
 
-def ahrs_error(gains: Gains, imu: Imu, start: Floats, truth: jaxekf.Encoder) -> OrientationError:
+def ahrs_error(
+    gains: Gains, imu: jaxekf.Imu, start: Floats, truth: jaxekf.Encoder
+) -> OrientationError:
     """Error of a filter of `ahrs` on one trial."""
     return scored(by_ahrs(gains, imu, start), imu.time_ns, truth)
 
 
 def scored(q: Floats, time_ns: Times, truth: jaxekf.Encoder) -> OrientationError:
-    """Error of quaternions (N, 4) at these instants."""
+    """Errors of quaternions (N, 4) at these times (N,)."""
     at = encoder_at(truth, time_ns)
     return orientation_error(q[at.scored], at.q_ref_body[at.scored])
 
 
-def of_all(
-    trials: Sequence[jaxekf.Recording], gains: Sequence[Gains], what: str
+def errors_of_gains(
+    trials: Sequence[jaxekf.Recording], gains: Sequence[Gains], description: str
 ) -> dict[Gains, list[OrientationError]]:
-    """Errors of filters of `ahrs`, which take 200 us a sample in Python, with each of these gains on each
-    trial; side by side."""
+    """Errors of filters of `ahrs` for each of these gains and each trial, in parallel processes, because
+    they take 200 us per sample in Python."""
     tasks = [(g, t.need_imu(), start_of(t), t.need_encoder()) for g in gains for t in trials]
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         waiting = [pool.submit(ahrs_error, *task) for task in tasks]
-        for _ in track(as_completed(waiting), what, len(waiting), console=CONSOLE, transient=True):
+        for _ in track(
+            as_completed(waiting), description, len(waiting), console=CONSOLE, transient=True
+        ):
             pass
     found: dict[Gains, list[OrientationError]] = {g: [] for g in gains}
     for (g, *_), done in zip(tasks, waiting, strict=True):
@@ -212,8 +218,8 @@ def of_all(
 
 
 def best(trials: Sequence[jaxekf.Recording], gains: Sequence[Gains]) -> Gains:
-    """Those gains whose error is least, in the mean of the trials."""
-    found = of_all(trials, gains, f"gains of {gains[0].kind}")
+    """The gains with the least mean error over the trials."""
+    found = errors_of_gains(trials, gains, f"gains of {gains[0].kind}")
     return min(found, key=lambda g: mean(found[g]).total_deg)
 
 
@@ -230,7 +236,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL")
     parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL")
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
-    parser.add_argument("--alone", action="store_true", help="leave the other filters out")
+    parser.add_argument("--alone", action="store_true", help="no comparison with other filters")
     arguments = parse(parser, "broad")
     if arguments.smoke:
         arguments.train, arguments.test = ["01"], ["02"]
@@ -239,12 +245,12 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
-def ours(
+def own_errors(
     trials: Sequence[jaxekf.Recording], params: jaxekf.Parameters, smoke: bool
 ) -> dict[str, list[OrientationError]]:
     """Errors of the model on each trial, filtered and smoothed."""
     found = {}
-    # The smoother is a program of its own.
+    # The smoother takes more time to compile.
     for name in ("filtered",) if smoke else ("filtered", "smoothed"):
         made = jaxekf.estimate_many(trials, marg.MODEL, params, smooth=name == "smoothed")
         found[name] = [
@@ -255,17 +261,17 @@ def ours(
 
 
 def installed(package: str) -> bool:
-    """Whether a package can be imported; if not, a sentence says that it is left out."""
+    """Whether a package can be imported; if not, print that it is left out."""
     found = find_spec(package) is not None
     if not found:
         print(f'{package} is left out: pip install "jaxekf[bench]"', file=sys.stderr)
     return found
 
 
-def theirs(
+def other_errors(
     training: Sequence[jaxekf.Recording], testing: Sequence[jaxekf.Recording], smoke: bool
 ) -> tuple[dict[str, list[OrientationError]], dict[str, Gains]]:
-    """Errors of the other filters that are installed on each test trial, and the gains that were found."""
+    """Errors of the installed other filters on each test trial, and their tuned gains."""
     found: dict[str, list[OrientationError]] = {}
     for name, offline in (("vqf", False), ("offline_vqf", True)) if installed("vqf") else ():
         found[name] = [
@@ -283,12 +289,12 @@ def theirs(
             training, [first._replace(integral=s * first.proportional) for s in SHARES]
         )
     for name, gains in chosen.items():
-        found[name] = of_all(testing, [gains], name)[gains]
+        found[name] = errors_of_gains(testing, [gains], name)[gains]
     return found, chosen
 
 
 def show(found: dict[str, list[OrientationError]], names: Sequence[str]) -> None:
-    """A table of the whole error of each trial, and the means of all three."""
+    """Print a table of the total error of each trial, and the means of the three errors."""
     table = Table("", *names, "mean", "heading", "inclination", title="RMSE, deg")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -309,18 +315,18 @@ def main() -> None:
         training, testing = (
             [piece(run, 60.0, 4.0) for run in runs] for runs in (training, testing)
         )
-        params, told = start_for(training), "not tuned"
+        params, summary = start_for(training), "not tuned"
     else:
         tuned = tuned_on(training, arguments.iterations)
         params, seconds = tuned.params, time.perf_counter() - began
-        told = f"tuned in {len(tuned.history)} steps, {seconds:.0f} s: {tuned.stopped}"
-    found = ours(testing, params, arguments.smoke)
+        summary = f"tuned in {len(tuned.history)} steps, {seconds:.0f} s: {tuned.stopped}"
+    found = own_errors(testing, params, arguments.smoke)
     gains: dict[str, Gains] = {}
     if not arguments.alone:
-        others, gains = theirs(training, testing, arguments.smoke)
+        others, gains = other_errors(training, testing, arguments.smoke)
         found |= others
     show(found, arguments.test)
-    print(told)
+    print(summary)
     for part in (params.noise, params.calibration):
         values = {k: np.round(np.asarray(v, float), 5).tolist() for k, v in part._asdict().items()}
         print("  " + ", ".join(f"{name} {value}" for name, value in values.items()))

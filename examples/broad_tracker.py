@@ -1,18 +1,18 @@
-"""Noise and calibration tuned on real recordings: the tracker made from BROAD trials.
+"""Noise and calibration tuned on real recordings: a tracker simulated from BROAD trials.
 
     python examples/broad_tracker.py FOLDER --train 01 05 10 16 --test 02 07 12 24 --seed 0
 
-FOLDER holds BROAD's MATLAB files. Each trial keeps its real gyroscope; its motion-capture attitude is
-the truth, and a decimated, noisy, interrupted copy of it is the tracker. From hand-set noise, Q and R
-are tuned by gradient on the training trials together with the gyroscope's clock offset and matrix
-(`--noise-only` leaves those out), and the test trials are estimated before and after, and smoothed. With
-`--calibrate` the objective is the likelihood of what was measured, with priors, and each trial has a
-matrix of its own, that of a test trial found from its innovations alone: its truth is for the score only.
+FOLDER has BROAD's MATLAB files. Each trial keeps its real gyroscope; the attitude by motion capture is the
+truth, and a decimated copy with noise and occlusions is the tracker. From hand-set noise, Q and R are tuned
+by gradient on the training trials together with the gyroscope's clock offset and matrix (`--noise-only`
+leaves these out). The test trials are estimated before and after the tuning, and smoothed. With
+`--calibrate` the objective is the likelihood of the measurements with priors, and each trial has a matrix
+of its own; that of a test trial is found from its innovations, and its truth is used only for the score.
 With `--baselines` each training trial is first held out in turn, and noise by Allan deviation alone and
-searches without gradients are compared with the tuning, with the work that each takes.
+searches without gradients are set beside the tuning, with the work that each takes.
 
-The last line printed is JSON with the attitude RMSE in degrees of each test trial. `--smoke` takes one
-iteration on ten seconds of a trial.
+The last line of the output is JSON with the attitude RMSE in degrees of each test trial. `--smoke` runs
+one iteration on ten seconds of a trial.
 """
 
 import argparse
@@ -33,7 +33,7 @@ CALIBRATION = ("calibration.clock_offset", "calibration.gyroscope_matrix")
 
 
 def hand_set() -> jaxekf.Parameters:
-    """What a careful user would write down without looking at the data."""
+    """Noise that a careful user would choose without looking at the data."""
     params = jaxekf.get_model("loose").parameters
     noise = params.noise._replace(
         gyroscope=np.deg2rad(0.02), bias_walk=np.deg2rad(0.005), optical=np.deg2rad(0.5)
@@ -42,7 +42,7 @@ def hand_set() -> jaxekf.Parameters:
 
 
 def load(folder: Path, trials: list[str], seed: int) -> list[jaxekf.Recording]:
-    """The tracker made from each trial."""
+    """Each trial with a simulated tracker."""
     return [
         broad.degrade(broad.load(broad.find(folder, trial)), seed=seed, trial=int(trial))
         for trial in trials
@@ -58,11 +58,11 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--baselines", nargs="*", choices=tuning.BASELINES, help="hold out, with these"
     )
-    parser.add_argument("--warm", action="store_true", help="begin with steps on the likelihood")
+    parser.add_argument("--warm", action="store_true", help="first iterations on the likelihood")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--noise-only", action="store_true", help="leave the calibration as it is")
+    which.add_argument("--noise-only", action="store_true", help="no tuning of the calibration")
     which.add_argument(
-        "--calibrate", action="store_true", help="by likelihood, a gyroscope matrix for each trial"
+        "--calibrate", action="store_true", help="likelihood, a gyroscope matrix for each trial"
     )
     arguments = parse(parser, "broad")
     if arguments.smoke:
@@ -77,8 +77,8 @@ def say_progress(step: tuning.Iteration, total: int) -> None:
         print(f"\r  step {step.number + 1}/{total}: {step.training:.5f}", end="", file=sys.stderr)
 
 
-def asked(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What is tuned, and by what."""
+def tuning_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The free parameters, the objective and the number of iterations."""
     found: dict[str, Any] = {"free": ["noise", *CALIBRATION], "iterations": arguments.iterations}
     found["warm"] = arguments.warm
     if arguments.noise_only:
@@ -93,17 +93,20 @@ def asked(arguments: argparse.Namespace) -> dict[str, Any]:
 def hold_out(
     runs: list[jaxekf.Recording], baselines: list[str], options: dict[str, Any]
 ) -> dict[str, Any]:
-    """Hold out each trial in turn, print how each variant does on it, and return all of it for JSON."""
+    """Hold out each trial in turn, print the scores of each variant, and return them for JSON."""
     found = tuning.cross_validate(
         runs, baselines=baselines, start=hand_set(), progress=say_progress, **options
     )
     errors, nees = found.spread(), found.spread("nees")
     print(
-        "held out in turn, mean ± deviation of a trial (worst); a filtering is one of all training trials"
+        "held out in turn, mean ± standard deviation of a trial (worst); work in passes of the filter over"
+        " all training trials"
     )
-    print(f"{'':>12}{'attitude RMSE, deg':>28}{'NEES':>30}{'filterings':>12}")
-    for variant, told in errors.items():
-        texts = [f"{a.mean:.3f} ± {a.deviation:.3f} ({a.worst:.3f})" for a in (told, nees[variant])]
+    print(f"{'':>12}{'attitude RMSE, deg':>28}{'NEES':>30}{'work':>12}")
+    for variant, error in errors.items():
+        texts = [
+            f"{a.mean:.3f} ± {a.deviation:.3f} ({a.worst:.3f})" for a in (error, nees[variant])
+        ]
         work = found.forward.get(variant, float("nan"))
         print(f"{variant:>12}{texts[0]:>28}{texts[1]:>30}{work:>12.0f}")
     return found.as_dict()
@@ -122,8 +125,8 @@ def main() -> None:
     start = hand_set()
     held_out = None
     if arguments.baselines is not None:
-        held_out = hold_out(training, arguments.baselines, asked(arguments))
-    tuned = tuning.tune(training, start=start, progress=say_progress, **asked(arguments))
+        held_out = hold_out(training, arguments.baselines, tuning_options(arguments))
+    tuned = tuning.tune(training, start=start, progress=say_progress, **tuning_options(arguments))
     own = tuning.fit_runs(testing, tuned)
     params = [own[trial.name] for trial in testing]
     compared = tuning.compare("loose", testing, {"initial": start, "tuned": params})
@@ -141,7 +144,7 @@ def main() -> None:
         key: [row.attitude_rmse_deg for row in compared.rows if row.variant == variant]
         for variant, key in columns.items()
     }
-    # A program of its own.
+    # The smoother takes more time to compile.
     smoothed = (
         [] if arguments.smoke else jaxekf.estimate_many(testing, "loose", params, smooth=True)
     )

@@ -1,14 +1,15 @@
-"""The experiment of Cheng (2023): a robot turns at a constant -9 deg/s about x.
+"""The experiment of Cheng (2023): a robot rotates at a constant -9 deg/s about x.
 
     python examples/constant_rate.py [--seeds 20] [-o FOLDER]
 
-A 62.5 Hz tracker and a 125 Hz gyroscope watch a joint that first rests, so that the bias can be
-measured, then turns; the tracker is hidden for 0.5 s. For each seed the three models estimate the run:
-`loose` (recommended), `loose_rate`, and `loose_additive` (the paper's own), which is also given the
-tracker held through the occlusion, as in the paper's experiment. With -o the figures are drawn.
+A 62.5 Hz tracker and a 125 Hz gyroscope measure a joint that first rests, so that the bias can be
+measured, then rotates; the tracker is hidden for 0.5 s. For each seed three models estimate the run:
+`loose` (recommended), `loose_rate`, and `loose_additive` (that of the paper). `loose` and `loose_additive`
+also estimate a run in which the last tracker sample is held during the occlusion, as in the paper. With -o
+the figures are drawn.
 
-The last line is JSON. The exit status is 1 where the recommended model misses what is expected of it.
-With --smoke one seed is estimated by `loose` alone, and nothing is asserted.
+The last line of the output is JSON. The exit status is 1 if the recommended model misses an expected
+value. With --smoke `loose` estimates one seed, and nothing is checked.
 """
 
 import argparse
@@ -32,7 +33,7 @@ MODELS = ("loose", "loose_rate", "loose_additive")
 
 
 def run(seed: int) -> jaxekf.Recording:
-    """One experiment."""
+    """Simulate one experiment."""
     motion = attitude_runs.constant_rate_motion(-9.0, REST_S)
     return attitude_runs.recording(
         f"seed-{seed}",
@@ -45,7 +46,7 @@ def run(seed: int) -> jaxekf.Recording:
 
 
 def held(record: jaxekf.Recording) -> jaxekf.Recording:
-    """The same run with the last visible tracker sample repeated through the occlusion."""
+    """The same run with the last visible tracker sample held during the occlusion."""
     optical = record.need_optical()
     q = metrics.hold_last(optical, optical.time_ns)
     seen = np.ones(len(q), bool)
@@ -53,7 +54,7 @@ def held(record: jaxekf.Recording) -> jaxekf.Recording:
 
 
 def parameters(name: str) -> jaxekf.Parameters:
-    """The noise the sensors really have; nothing is known of the motion but that it is slow to change."""
+    """The true noise of the sensors, and a large noise of the angular acceleration."""
     params = jaxekf.get_model(name).parameters
     noise = params.noise._replace(bias_walk=np.deg2rad(GRADE.bias_walk_deg))
     if name != "loose":
@@ -80,7 +81,7 @@ def occlusion_rmse(estimate: jaxekf.Estimate, record: jaxekf.Recording) -> float
 
 
 def bias_within(estimate: jaxekf.Estimate, record: jaxekf.Recording) -> np.ndarray:
-    """For each axis, whether the final bias lies within 2 sigma of the one measured at rest."""
+    """For each axis, whether the final bias is within 2 sigma of the mean at rest."""
     imu = record.need_imu()
     rest = imu.gyroscope[imu.time_ns < imu.time_ns[0] + int(REST_S * 1e9)].mean(axis=0)
     return np.abs(estimate.bias.value[-1] - rest) <= 2.0 * estimate.bias.sigma[-1]
@@ -139,7 +140,7 @@ def main() -> None:
     if arguments.output is not None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         estimate = jaxekf.estimate(records[0], "loose", parameters("loose"))
-        for name in plots.possible_figures(estimate, records[0]):
+        for name in plots.available_figures(estimate, records[0]):
             figure = plots.figure_functions()[name](estimate, records[0])
             plots.save(figure, arguments.output / f"{name}.png")
     summary = {"measurement_deg": raw[0], "measurement_deg_s": raw[1], **table}

@@ -1,8 +1,8 @@
-"""The posterior Cramer-Rao bound of a tracked tool with an IMU, from the equations on paper.
+"""The posterior Cramer-Rao bound of a tracked tool with an IMU.
 
 For a given motion and Gaussian noise it is the covariance of the error-state filter linearised at the
-*true* motion (Tichavsky, Muravchik, Nehorai 1998). Everything here is NumPy with Jacobians derived by
-hand: nothing is shared with the estimator that is judged by it.
+*true* motion (Tichavsky, Muravchik, Nehorai 1998). This file uses NumPy and Jacobians derived by hand, and
+shares no code with the estimator that is compared with the bound.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ PRIOR = {"position": 0.01, "attitude": np.deg2rad(5.0), "velocity": 0.3}
 
 
 class Bound(NamedTuple):
-    """Root mean square of the least possible standard deviations over a window."""
+    """RMS over a window of the lower bounds of the standard deviations."""
 
     x_mm: float
     yaw_rad: float
@@ -51,14 +51,14 @@ def _transitions(motion: ToolMotion, t: Any, dt: float) -> tuple[Floats, Floats]
 
 
 def _yaw_slope(turn: Floats) -> Floats:
-    """Derivative (3,) of ``atan2(R10, R00)`` by an error on the right of the attitude."""
+    """Derivative (3,) of ``atan2(R10, R00)`` with respect to the attitude error in the body frame."""
     moved = [turn @ _cross(axis) for axis in np.eye(3)]
     length = turn[0, 0] ** 2 + turn[1, 0] ** 2
     return np.array([(turn[0, 0] * m[1, 0] - turn[1, 0] * m[0, 0]) / length for m in moved])
 
 
 def _seen(cov: Floats, turn: Floats, arms: list[Floats], sigma: float) -> Floats:
-    """The covariance after these markers were measured."""
+    """The covariance after the measurement of these markers."""
     for arm in arms:
         slope = np.zeros((3, 15))
         slope[:, _POSITION] = np.eye(3)
@@ -77,9 +77,9 @@ def bound(
     duration_s: float,
     window: tuple[float, float],
 ) -> Bound:
-    """What no estimator can beat at time t with only the frames that had arrived by then.
+    """The bound for causal estimators, which use at time t only the frames that had arrived by then.
 
-    Evaluated at every IMU sample of the window (start included, end not).
+    It is evaluated at every IMU sample of the window, without its end.
     """
     dt, tool = grade.imu_s, Tool()
     t = dt * np.arange(round(duration_s / dt) + 1)
@@ -119,7 +119,7 @@ def bound(
 
 
 def density_factor(motion: ToolMotion, grade: ToolGrade, x_mm: float, **at: object) -> float:
-    """The factor on both white densities at which the bound in x is `x_mm` with all markers seen."""
+    """The factor of both white noise densities for which the bound of x is `x_mm`, all markers visible."""
     low, high = 0.05, 1.0
     for _ in range(12):
         middle = 0.5 * (low + high)
@@ -129,7 +129,7 @@ def density_factor(motion: ToolMotion, grade: ToolGrade, x_mm: float, **at: obje
 
 
 def scaled(grade: ToolGrade, factor: float) -> ToolGrade:
-    """The grade with both white densities of the IMU times a factor."""
+    """The grade with both white noise densities of the IMU times a factor."""
     from dataclasses import replace
 
     return replace(

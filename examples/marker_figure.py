@@ -28,7 +28,7 @@ def draw(
     file: Path,
     seed: int = 0,
 ) -> None:
-    """One run of one seed for each number of hidden markers, as a live system would have seen it."""
+    """Draw causal estimates of one seed, for each number of hidden markers."""
     with mpl.rc_context(plots.STYLE):
         figure = Figure(figsize=(12, 9), layout="constrained")
         grid = figure.subplots(len(COUNTS), 4, sharex=True, width_ratios=[3, 2, 3, 2])
@@ -91,11 +91,11 @@ def _draw_row(
             where="post",
             color=plots.MEASURED,
             lw=1.0,
-            label="tracker, late",
+            label="tracker, at arrival",
         )
         wide.plot(t[near], truth, color=plots.TRUTH, lw=2.2, label="truth")
         plots.band(wide, t[near], centre, sigma, "2σ")
-        wide.plot(t[near], centre, color=plots.ESTIMATE, lw=1.0, ls="--", label="estimate, live")
+        wide.plot(t[near], centre, color=plots.ESTIMATE, lw=1.0, ls="--", label="causal estimate")
         wide.set_ylabel(label)
         plots.band(narrow, t[near], 0.0 * centre, sigma, None)
         narrow.plot(t[near], centre - truth, color=plots.ESTIMATE, lw=0.8)

@@ -1,14 +1,14 @@
 """Hidden markers, a late tracker and an IMU: Table I and figure 2 of Tobergte, Pomarlan, Hirzinger (2009).
 
 A tool with three markers on an L moves in six degrees of freedom; the tracker's frames come every 18 ms
-and 34 ms late, the IMU's every 2 ms. From 15 s on one, two or all markers are hidden for 3 s. Scored is
-what a live system would have said at every sample of the IMU: at time t only with what had arrived by
-t. Beside it stands the posterior Cramer-Rao bound on the same data (`marker_bound.py`).
+with a latency of 34 ms, the IMU's samples every 2 ms. From 15 s on one, two or all markers are hidden for
+3 s. Scores are those of causal estimates at every IMU sample, from the measurements that had arrived by
+then. They are compared with the posterior Cramer-Rao bound (`marker_bound.py`).
 
     python examples/marker_occlusion.py [--seeds 1000] [--quick] [--smoke] [-o FOLDER]
 
-The last line is JSON; the exit status is 1 where a figure is missed. With --smoke two seeds of grade (a)
-are estimated, and nothing is asserted.
+The last line of the output is JSON; the exit status is 1 if an expected value is missed. With --smoke two
+seeds of grade (a) are estimated, and nothing is checked.
 """
 
 import argparse
@@ -33,9 +33,9 @@ from marker_bound import PRIOR, Bound, bound, density_factor, scaled
 from marker_figure import draw
 from rich.progress import Progress
 
-from jaxekf.estimation import batch, causal, parameters, timeline
+from jaxekf import timeline
+from jaxekf.estimation import causal
 from jaxekf.evaluation import metrics
-from jaxekf.filtering import ekf
 from jaxekf.models import tight
 from jaxekf.pose_solvers import marker_pose
 from jaxekf.recordings.types import Floats
@@ -44,11 +44,12 @@ from jaxekf.simulation.marker_runs import ToolGrade
 
 DURATION_S, HIDDEN_S = 18.0, 15.0
 WINDOW = (HIDDEN_S, DURATION_S)
-# The corner, where the IMU sits, is hidden last.
+# The marker at the corner, the position of the IMU, is hidden last.
 ORDER = ("3", "2", "1")
 PAPER_X_MM = (0.12, 0.15, 0.17, 29.2)
 PAPER_YAW = (0.0006, 0.0011, 0.0010, 0.0009)
 BATCH = 40
+DEVICES = tuple(jax.devices()) if len(jax.devices()) > 1 else ()
 MOTION = marker_runs.sinusoidal_motion()
 
 
@@ -58,7 +59,7 @@ def hidden(count: int) -> list[tuple[str, float, float]]:
 
 
 def model_parameters(grade: ToolGrade) -> jaxekf.Parameters:
-    """What the simulation was made with."""
+    """The noise of the simulation."""
     params = tight.MODEL.parameters
     noise = tight.Noise(
         gyroscope=np.deg2rad(grade.gyroscope_deg),
@@ -70,23 +71,23 @@ def model_parameters(grade: ToolGrade) -> jaxekf.Parameters:
     initial = params.initial._replace(
         **PRIOR, bias=np.deg2rad(grade.bias_deg), accelerometer_bias=grade.accelerometer_bias
     )
-    return parameters.as_arrays(params._replace(noise=noise, initial=initial))
+    return jax.tree.map(jnp.asarray, params._replace(noise=noise, initial=initial))
 
 
 class Layout(NamedTuple):
-    """Where things stand in time, the same in every seed."""
+    """The time grid, the same for every seed."""
 
     line: timeline.Timeline
     last: int
-    """The last epoch before markers are hidden."""
-    ahead: causal.Outlook
-    """From each epoch whose belief is told in the window."""
+    """Index of the last epoch before markers are hidden."""
+    ahead: causal.Extrapolation
+    """Extrapolation of the epochs with causal estimates in the window."""
     first: int
-    """The first of those epochs."""
+    """Index of the first of these epochs."""
     truth: tuple[Floats, Floats]
-    """Position x and yaw at the outlook's instants."""
-    judged: Any
-    """Instants of the outlook in the window."""
+    """Position x and yaw at the instants of the extrapolation."""
+    scored: Any
+    """Flags of the instants of the extrapolation in the window."""
 
 
 def yaw_of(q: Any) -> Any:
@@ -101,11 +102,11 @@ def lay_out(grade: ToolGrade) -> Layout:
         "layout", MOTION, seed=0, duration_s=DURATION_S, grade=grade
     )
     line = timeline.build(tight.MODEL, recording)
-    view = causal.outlook(line, recording.need_markers().latency_ns)
-    inside = (view.time_ns >= HIDDEN_S * 1e9) & (view.time_ns < DURATION_S * 1e9) & view.wanted
+    view = causal.plan_extrapolation(line, recording.need_markers().latency_ns)
+    inside = (view.time_ns >= HIDDEN_S * 1e9) & (view.time_ns < DURATION_S * 1e9) & view.latest
     chosen = np.flatnonzero(inside.any(axis=1))
     first = int(chosen[0])
-    view = view.starting(first)
+    view = view.from_epoch(first)
     t = view.time_ns / 1e9
     q, _ = MOTION.attitude.attitude(t.reshape(-1))
     x = MOTION.position(t.reshape(-1))[:, 0].reshape(t.shape)
@@ -115,7 +116,7 @@ def lay_out(grade: ToolGrade) -> Layout:
 
 
 class Samples(NamedTuple):
-    """What the sensors said, one seed after the other."""
+    """Simulated measurements of all seeds."""
 
     imu: Any
     """(seeds, N, 6)."""
@@ -124,7 +125,7 @@ class Samples(NamedTuple):
 
 
 def record(seeds: range, grade: ToolGrade) -> Samples:
-    """The same run recorded once for each seed."""
+    """Simulate the same motion once for each seed."""
     imu, markers = [], []
     for seed in seeds:
         one = marker_runs.tool_recording(
@@ -137,7 +138,7 @@ def record(seeds: range, grade: ToolGrade) -> Samples:
 
 
 def starts(samples: Samples) -> Any:
-    """First states, from the pose of the first frame and the step to the second."""
+    """Initial states, from the pose of the first frame and the displacement to the second."""
     arms = marker_runs.Tool().p_body_marker
     seen = np.ones((*samples.markers.shape[:1], 3), bool)
     one, two = (marker_pose.absolute_orientation(arms, samples.markers[:, k], seen) for k in (0, 1))
@@ -146,17 +147,17 @@ def starts(samples: Samples) -> Any:
     return jax.vmap(tight.MODEL.initial_mean)(jax.tree.map(jnp.asarray, known))
 
 
-def knots_of(line: timeline.Timeline, imu: Any) -> timeline.Knots:
-    """The input of each seed with its running integral."""
+def knots_of(line: timeline.Timeline, imu: Any) -> jaxekf.Knots:
+    """The input of each seed with its cumulative integral."""
     assert line.steps.knots is not None
     time = jnp.asarray(line.steps.knots.time)
     areas = 0.5 * (imu[:, 1:] + imu[:, :-1]) * jnp.diff(time)[None, :, None]
     integral = jnp.concatenate([jnp.zeros_like(imu[:, :1]), jnp.cumsum(areas, axis=1)], axis=1)
-    return timeline.Knots(jnp.broadcast_to(time, imu.shape[:2]), imu, integral)
+    return jaxekf.Knots(jnp.broadcast_to(time, imu.shape[:2]), imu, integral)
 
 
-def steps_of(layout: Layout, samples: Samples, epochs: slice, shown: Any) -> timeline.Steps:
-    """Some epochs of every seed, of the markers only those shown."""
+def steps_of(layout: Layout, samples: Samples, epochs: slice, shown: Any) -> jaxekf.Steps:
+    """Some epochs of every seed, with the flags `shown` (3,) of the visible markers."""
     seeds = samples.imu.shape[0]
 
     def every(a: Any) -> Any:
@@ -168,12 +169,12 @@ def steps_of(layout: Layout, samples: Samples, epochs: slice, shown: Any) -> tim
     for i, (name, rows) in enumerate(line.steps.slow.items()):
         frame = np.round((line.steps.time[:, -1]) / ToolGrade().tracker_s).astype(int)
         value = jnp.asarray(samples.markers)[:, frame[epochs], i]
-        slow[name] = timeline.Rows(
+        slow[name] = jaxekf.Rows(
             value, every(rows.aux), every(rows.mask) & shown[i], every(rows.dt)
         )
     at = line.steps
     knots = knots_of(line, jnp.asarray(samples.imu))
-    return timeline.Steps(every(at.time), every(at.dt), every(at.valid), knots, {}, slow)
+    return jaxekf.Steps(every(at.time), every(at.dt), every(at.valid), knots, {}, slow)
 
 
 def repeated(params: jaxekf.Parameters, count: int) -> jaxekf.Parameters:
@@ -181,8 +182,8 @@ def repeated(params: jaxekf.Parameters, count: int) -> jaxekf.Parameters:
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), params)
 
 
-class Running:
-    """The filter and its outlook for one layout, compiled once for all grades and batches."""
+class CausalFilter:
+    """The filter and its extrapolation for one layout, compiled once for all grades and batches."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -191,18 +192,18 @@ class Running:
 
     def _filter(self, params: jaxekf.Parameters, belief: Any, steps: Any) -> Any:
         every = repeated(params, steps.dt.shape[0])
-        output = ekf.run_filter_batch(
+        output = jaxekf.run_filter_batch(
             tight.MODEL,
             every,
             belief,
             steps,
             keep="estimates",
-            devices=batch.sharing_devices(),
+            devices=DEVICES,
         )
         return jax.tree.map(lambda a: a[:, :, -1], output.instants.updated)
 
     def _common(self, params: jaxekf.Parameters, mean: Any, samples: Samples) -> Any:
-        """Beliefs at the last epochs before the markers are hidden."""
+        """Beliefs at the last epochs before markers are hidden."""
         seeds = samples.imu.shape[0]
         cov = tight.MODEL.initial_covariance(params)
         belief = jaxekf.Belief(mean, jnp.broadcast_to(cov, (seeds, *cov.shape)))
@@ -220,7 +221,7 @@ class Running:
         ahead = jax.vmap(lambda knots: layout.ahead.with_input(knots).knots)(steps.knots)
         count = layout.ahead.time_ns.shape[0]
         flat = partial(jax.tree.map, lambda a: a.reshape(seeds * count, *a.shape[2:]))
-        told = causal.carry_on(
+        mean = causal.extrapolate(
             tight.MODEL,
             repeated(params, seeds * count),
             flat(beliefs),
@@ -230,36 +231,41 @@ class Running:
             "means",
         ).instants.updated.mean
         shape = (seeds, *layout.ahead.time_ns.shape)
-        x = told.position[..., 0].reshape(shape) - layout.truth[0]
-        yaw = yaw_of(told.q_ref_body).reshape(shape) - layout.truth[1]
+        x = mean.position[..., 0].reshape(shape) - layout.truth[0]
+        yaw = yaw_of(mean.q_ref_body).reshape(shape) - layout.truth[1]
         yaw = jnp.arctan2(jnp.sin(yaw), jnp.cos(yaw))
-        judged = layout.judged[None]
-        return jnp.stack([jnp.sum(jnp.where(judged, e * e, 0.0), axis=(1, 2)) for e in (x, yaw)])
+        scored = layout.scored[None]
+        return jnp.stack([jnp.sum(jnp.where(scored, e * e, 0.0), axis=(1, 2)) for e in (x, yaw)])
 
 
 def errors(
-    running: Running, grade: ToolGrade, seeds: int, batch: int, progress: Progress, name: str
+    causal_filter: CausalFilter,
+    grade: ToolGrade,
+    seeds: int,
+    batch: int,
+    progress: Progress,
+    name: str,
 ) -> list[Bound]:
     """Pooled RMS errors of the online estimate for 0, 1, 2 and 3 hidden markers."""
-    layout, params = running.layout, model_parameters(grade)
+    layout, params = causal_filter.layout, model_parameters(grade)
     task = progress.add_task(name, total=seeds)
     squares = np.zeros((4, 2))
     for start in range(0, seeds, batch):
-        # The last batch is filled up: another size would be another program.
+        # The last batch is filled up, since another size would need another compilation.
         samples = record(range(start, start + batch), grade)
         real = min(batch, seeds - start)
-        before = running.common(params, starts(samples), samples)
+        before = causal_filter.common(params, starts(samples), samples)
         for count in range(4):
             shown = np.array([n not in ORDER[:count] for n in marker_runs.Tool().names])
-            total = running.branch(params, before, samples, shown)
+            total = causal_filter.branch(params, before, samples, shown)
             squares[count] += np.asarray(total)[:, :real].sum(axis=1)
         progress.update(task, advance=real)
-    x, yaw = np.sqrt(squares / (seeds * layout.judged.sum())).T
+    x, yaw = np.sqrt(squares / (seeds * layout.scored.sum())).T
     return [Bound(1e3 * float(a), float(b)) for a, b in zip(x, yaw, strict=True)]
 
 
 def raw_errors(seeds: int) -> dict[str, Bound]:
-    """The tracker alone: each frame against the truth of when it was taken, and held until the next."""
+    """Errors of the tracker alone: at the time a frame was taken, and held from its arrival to the next."""
     exact, late = [], []
     for seed in range(min(seeds, 100)):
         run = marker_runs.tool_recording("run", MOTION, seed=seed, duration_s=DURATION_S)
@@ -280,13 +286,13 @@ def raw_errors(seeds: int) -> dict[str, Bound]:
             found.append([np.mean(x**2), np.mean(yaw**2)])
     both = [np.sqrt(np.mean(found, axis=0)) for found in (exact, late)]
     return {
-        "raw tracker, at its own time": Bound(1e3 * float(both[0][0]), float(both[0][1])),
-        "raw tracker, late and held": Bound(1e3 * float(both[1][0]), float(both[1][1])),
+        "raw tracker, at the time taken": Bound(1e3 * float(both[0][0]), float(both[0][1])),
+        "raw tracker, held from arrival": Bound(1e3 * float(both[1][0]), float(both[1][1])),
     }
 
 
 def cyclic(seeds: int) -> dict[str, list[float]]:
-    """One marker at a time for 60 s: position (mm) and attitude (rad) RMSE by stretches of 10 s."""
+    """One visible marker at a time for 60 s: position (mm) and attitude (rad) RMSE of intervals of 10 s."""
     names, duration = marker_runs.Tool().names, 60.0
     runs = [
         marker_runs.tool_recording(
@@ -318,7 +324,7 @@ def cyclic(seeds: int) -> dict[str, list[float]]:
 
 
 def print_table(grade: str, found: list[Bound], least: list[Bound]) -> None:
-    """Ours beside the bound and the paper."""
+    """Print the errors with the bound and the values of the paper."""
     print(f"\n{grade}")
     print(
         f"{'hidden':>8}{'x (mm)':>10}{'bound':>9}{'paper':>9}   {'yaw (rad)':>10}{'bound':>10}{'paper':>9}"
@@ -333,7 +339,7 @@ def print_table(grade: str, found: list[Bound], least: list[Bound]) -> None:
 def checks_of(
     found: dict[str, Any], bounds: dict[str, Any], repeat: dict[str, Any]
 ) -> dict[str, bool]:
-    """Each figure that must hold."""
+    """The checks of the expected values."""
     checks = {}
     for grade, ours in found.items():
         ratios = [
@@ -360,8 +366,8 @@ def checks_of(
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=1000)
-    parser.add_argument("--quick", action="store_true", help="40 seeds, nothing is asserted")
-    parser.add_argument("--smoke", action="store_true", help="two seeds, grade (a) alone")
+    parser.add_argument("--quick", action="store_true", help="40 seeds, nothing is checked")
+    parser.add_argument("--smoke", action="store_true", help="two seeds, grade (a) only")
     parser.add_argument("-o", "--output", type=Path, help="folder for the figure")
     arguments = parser.parse_args()
     smoke, batch = arguments.smoke, 2 if arguments.smoke else BATCH
@@ -377,12 +383,12 @@ def main() -> None:
         titles["b"] = (
             f"(b) both densities times {factor:.4f}: the bound with no hidden marker is 0.12 mm"
         )
-    running = Running(lay_out(grade))
+    causal_filter = CausalFilter(lay_out(grade))
     found, bounds = {}, {}
     with Progress(transient=True, disable=not sys.stderr.isatty()) as progress:
         for name, one in grades.items():
             bounds[name] = [bound(MOTION, one, hidden(count), **at) for count in range(4)]
-            found[name] = errors(running, one, seeds, batch, progress, f"grade {name}")
+            found[name] = errors(causal_filter, one, seeds, batch, progress, f"grade {name}")
     for name, title in titles.items():
         print_table(title, found[name], bounds[name])
     raw = raw_errors(seeds)
@@ -392,7 +398,7 @@ def main() -> None:
     repeat, checks = {}, {}
     if not smoke:
         repeat = cyclic(4 if arguments.quick else 20)
-        print("\none marker at a time from 5 s on, RMSE by stretches of 10 s")
+        print("\none visible marker at a time from 5 s on, RMSE of intervals of 10 s")
         for name, values in repeat.items():
             print(f"{name:<14}" + "".join(f"{v:>10.5f}" for v in values))
         checks = checks_of(found, bounds, repeat)

@@ -1,17 +1,17 @@
 """An instrument in a surgeon's hand: attitude from accelerometers and a magnetometer, without a gyroscope.
 
-    python examples/microsurgery.py [--minutes 30] [--seed 0] [--output PICTURE.png] [--smoke]
+    python examples/microsurgery.py [--minutes 30] [--seed 0] [--output FIGURE.png] [--smoke]
 
-The simulated system of Ang, Khosla and Riviere at 500 Hz: three dual-axis accelerometers, whose
-differences tell the rate and whose mean tells where down is, and a magnetometer. The model `triad` filters
-it, with noise that follows from the data sheets, the array's geometry and the hand's acceleration alone:
-nothing is tuned. Beside it stand the rate integrated by itself and TRIAD by itself. A second run, in which
-the hand turns but does not accelerate, shows whether the filter knows its own error.
+The simulated system of Ang, Khosla and Riviere at 500 Hz has a magnetometer and three dual-axis
+accelerometers, whose differences give the rate and whose mean gives the vertical. The model `triad` filters
+it, with noise from data sheets, the geometry of the array and the acceleration of the hand: nothing is
+tuned. The result is compared with the integrated rate alone and with TRIAD alone. A second run, in which
+the hand rotates but does not accelerate, shows whether the filter is consistent.
 
-Half an hour, 900,000 steps, is filtered in one piece and takes some 4 GB of memory.
+Half an hour, 900,000 steps, is filtered in one piece and needs about 4 GB of memory.
 
-The last line is JSON; the exit status is 1 where a figure is missed. With --smoke half a minute is
-estimated, and nothing is asserted.
+The last line of the output is JSON; the exit status is 1 if an expected value is missed. With --smoke half
+a minute is estimated, and nothing is checked.
 """
 
 import argparse
@@ -29,7 +29,6 @@ from jax import Array
 from rich.progress import Progress
 
 import jaxekf
-from jaxekf.estimation.parameters import as_arrays
 from jaxekf.evaluation import consistency, metrics
 from jaxekf.geometry import rotation
 from jaxekf.models import triad
@@ -40,11 +39,11 @@ from jaxekf.simulation.marker_runs import ToolMotion
 
 GRADE = gyro_free_runs.SurgeryGrade()
 PART_S = 300.0
-"""The first and the last part of a run that are compared; a third of it where it is short."""
+"""Length of the first and the last part of a run, which are compared; at most a third of the run."""
 SETTLE_S = 5.0
-"""The filter's consistency is judged from here on: the rate at the start is unknown."""
+"""Consistency is evaluated from this time on, because the initial rate is unknown."""
 FIRST_RATE = 0.2
-"""Standard deviation of the rate at the start, rad/s, which the array cannot tell: a hand's."""
+"""Standard deviation of the initial rate of a hand, rad/s, which the array does not measure."""
 CLOSE_S = 2.0
 _BINS = 150
 
@@ -61,8 +60,7 @@ class Run(NamedTuple):
 
 
 def acceleration_rms(motion: ToolMotion) -> float:
-    """Root mean square of the body's acceleration along an axis, m/s^2: sinusoids have half their
-    amplitude's square."""
+    """RMS acceleration of the body along one axis, m/s^2; it is a sum of sinusoids."""
     peak = motion.amplitude * (2.0 * np.pi * motion.frequency) ** 2
     return float(np.sqrt(np.sum(0.5 * peak**2) / 3.0))
 
@@ -70,13 +68,14 @@ def acceleration_rms(motion: ToolMotion) -> float:
 def parameters(acceleration: float) -> jaxekf.Parameters:
     """Noise of the filter, from the sensors, the array and the `acceleration` of the body, m/s^2.
 
-    The bias takes the walk of the array's rate. Between two samples that walk is taken for a straight
-    line, of which the bridge with the variance ``walk^2 T^2 / 12`` is left, and nothing else, for the white
+    The random walk of the array's rate is that of the bias. The filter interpolates the rate linearly
+    between two samples; the remaining Brownian bridge, with the variance ``walk^2 T^2 / 12``, is the white
     noise of the rate. Each component of the specific force is the mean of two axes.
 
-    The magnetometer is so much better that the error of TRIAD lies nearly in a plane, and turns with the
-    error of the force: its second order, ``(force error / g)^2 tan(dip)`` at a dip of some 60 deg and more,
-    is what the covariance of eqs. 41 to 46 lacks. It is added to the noise of the field.
+    The magnetometer is much more accurate than the accelerometers, so that the error of TRIAD is nearly in
+    a plane that rotates with the error of the force. Its second-order part,
+    ``(force error / g)^2 tan(dip)`` at a dip of about 60 deg or more, is missing in the covariance of eqs.
+    41 to 46 and is added to the noise of the field.
     """
     walk = gyro_free_runs.rate_walk(gyro_free_runs.handheld_array(), GRADE)
     force = np.hypot(GRADE.acceleration_sigma / np.sqrt(2.0), acceleration)
@@ -89,42 +88,42 @@ def parameters(acceleration: float) -> jaxekf.Parameters:
         accelerometer=force,
         magnetometer=np.hypot(field, curved * np.tan(np.deg2rad(GRADE.dip_deg))),
     )
-    # The array's rate is early by half an interval; see `simulate_surgery.array_rate`.
+    # The array's rate is early by half an interval; see `gyro_free_runs.array_rate`.
     calibration = params.calibration._replace(clock_offset=-0.5 / GRADE.hertz)
     initial = params.initial._replace(bias=FIRST_RATE)
-    return as_arrays(params._replace(noise=noise, calibration=calibration, initial=initial))
+    return params._replace(noise=noise, calibration=calibration, initial=initial)
 
 
 def run(seed: int, minutes: float, *, body_acceleration: bool = True) -> Run:
-    """Simulate and estimate."""
+    """Simulate and estimate one run."""
     motion = gyro_free_runs.surgical_motion(seed, body_acceleration=body_acceleration)
     array = gyro_free_runs.handheld_array()
     name = "microsurgery" if body_acceleration else "microsurgery, no acceleration"
     begin = time.perf_counter()
-    felt = gyro_free_runs.array_run(
+    simulated = gyro_free_runs.array_run(
         motion, array, seed=seed, duration_s=60.0 * minutes, grade=GRADE
     )
     made = time.perf_counter()
-    recording = gyro_free_runs.array_recording(name, felt, array, grade=GRADE)
+    recording = gyro_free_runs.array_recording(name, simulated, array, grade=GRADE)
     rated = time.perf_counter()
     estimate = jaxekf.estimate(recording, "triad", parameters(acceleration_rms(motion)))
     done = time.perf_counter()
-    error = metrics.attitude_error(estimate.attitude.value, felt.truth.q_ref_body)
+    error = metrics.attitude_error(estimate.attitude.value, simulated.truth.q_ref_body)
     return Run(recording, estimate, error, made - begin, rated - made, done - rated)
 
 
 def triad_error(recording: jaxekf.Recording) -> Floats:
-    """Error (N, 3) in rad of TRIAD on each sample by itself."""
+    """Error (N, 3) in rad of TRIAD applied to each sample."""
     return metrics.attitude_error(
         triad.attitude(recording).value, recording.need_encoder().q_ref_body
     )
 
 
 def rate_error(recording: jaxekf.Recording) -> Floats:
-    """Error (N, 3) in rad of the rate integrated from the true first attitude and rate."""
+    """Error (N, 3) in rad of the rate integrated from the true initial attitude and rate."""
     imu, truth = recording.need_imu(), recording.need_encoder().q_ref_body
     first = -GRADE.hertz * metrics.attitude_error(truth[1:2], truth[:1])
-    # Its value half an interval late is the mean over the interval.
+    # The value half an interval later is the mean over the interval.
     rate = imu.gyroscope - imu.gyroscope[0] + first
     turned = _integrate(truth[0], rate[:-1] / GRADE.hertz)
     return metrics.attitude_error(np.concatenate([truth[:1], turned]), truth)
@@ -140,7 +139,7 @@ def _integrate(first: Array, turns: Array) -> Array:
 
 
 def nees(made: Run) -> consistency.Consistency:
-    """Normalised square of the attitude error, with the interval that its correlation in time allows."""
+    """NEES of the attitude, with a confidence interval that accounts for correlation in time."""
     late = made.estimate.time >= SETTLE_S
     squares = metrics.normalised_square(made.error[late], made.estimate.attitude.cov[late])
     return consistency.judge_squares([squares], [np.full(len(squares), 3)])
@@ -158,11 +157,11 @@ def rms_deg(error: Floats) -> float:
 
 
 def compare(full: Run, still: Run) -> dict[str, Any]:
-    """Every figure, of the run with all accelerations and of that without."""
+    """The results of the run with acceleration and of the one without."""
     t = full.estimate.time
     first, last = ends(t)
     alone, integrated = triad_error(full.recording), rate_error(full.recording)
-    told, told_full = nees(still), nees(full)
+    consistent, consistent_full = nees(still), nees(full)
     taken = full.rate_s + full.filter_s
     return {
         "minutes": float(t[-1] / 60.0),
@@ -178,11 +177,11 @@ def compare(full: Run, still: Run) -> dict[str, Any]:
         "no_acceleration": {
             "filter_deg": rms_deg(still.error),
             "triad_deg": rms_deg(triad_error(still.recording)),
-            "nees": told.mean,
-            "nees_interval": list(told.interval),
-            "independent_samples": told.effective,
+            "nees": consistent.mean,
+            "nees_interval": list(consistent.interval),
+            "independent_samples": consistent.effective,
         },
-        "nees_with_acceleration": told_full.mean,
+        "nees_with_acceleration": consistent_full.mean,
         "simulate_s": full.simulate_s,
         "rate_s": full.rate_s,
         "filter_s": full.filter_s,
@@ -191,23 +190,24 @@ def compare(full: Run, still: Run) -> dict[str, Any]:
 
 
 def checks_of(found: dict[str, Any]) -> dict[str, bool]:
-    """What must hold."""
+    """The checks of the expected values."""
     low, high = found["no_acceleration"]["nees_interval"]
     return {
-        "the rate alone drifts: 10 times the filter's error within 10 s": (
+        "the integrated rate drifts: 10 times the filter's error within 10 s": (
             found["rate_alone_deg"]["10 s"] > 10.0 * found["filter_deg"]
         ),
-        "the filter does not: last part at most 1.2 of the first": (
+        "the filter does not drift: error of the last part at most 1.2 of the first": (
             found["filter_last_deg"] <= 1.2 * found["filter_first_deg"]
         ),
-        "filter at most 0.25 of TRIAD": found["filter_deg"] <= 0.25 * found["triad_deg"],
+        "error of the filter at most 0.25 of TRIAD's": found["filter_deg"]
+        <= 0.25 * found["triad_deg"],
         "NEES without acceleration: 1 within its interval": low <= 1.0 <= high,
         "faster than real time": found["faster_than_real_time"] > 1.0,
     }
 
 
-def picture(full: Run) -> Any:
-    """Errors about the three axes: over the whole run, as root mean squares, and close up with 2 sigma."""
+def figure_of(full: Run) -> Any:
+    """Figure of the errors about the three axes: RMS over the whole run, and the end with 2 sigma bands."""
     estimate, t = full.estimate, full.estimate.time
     alone, integrated = triad_error(full.recording), rate_error(full.recording)
     sigma = np.rad2deg(estimate.attitude.sigma)
@@ -220,14 +220,14 @@ def picture(full: Run) -> Any:
         for i, axis in enumerate(style.AXES):
             left, right = grid[i]
             for error, colour, name in (
-                (integrated, style.HELD, "rate integrated alone"),
-                (alone, style.MEASURED, "TRIAD alone"),
+                (integrated, style.HELD, "integrated rate"),
+                (alone, style.MEASURED, "TRIAD"),
                 (full.error, style.ESTIMATE, "filter"),
             ):
                 square = np.bincount(bins, np.rad2deg(error[:, i]) ** 2) / count
                 left.plot(middle, np.sqrt(square), color=colour, lw=1.2, label=name)
             left.set_yscale("log")
-            left.set_ylabel(f"rms error about {axis} (deg)")
+            left.set_ylabel(f"RMS error about {axis} (deg)")
             own = np.rad2deg(full.error[close, i])
             right.plot(
                 t[close],
@@ -235,30 +235,30 @@ def picture(full: Run) -> Any:
                 ".",
                 ms=2.5,
                 color=style.MEASURED,
-                label="TRIAD alone",
+                label="TRIAD",
             )
             style.band(right, t[close], np.zeros(len(own)), sigma[close, i], "2σ of the filter")
             right.plot(t[close], own, color=style.ESTIMATE, lw=1.2, label="filter")
             right.set_ylabel(f"error about {axis} (deg)")
             right.margins(x=0)
-        grid[0, 0].set_title(f"whole run, in parts of {edges[1]:.3g} s", fontsize=9)
+        grid[0, 0].set_title(f"whole run, RMS of intervals of {edges[1]:.3g} s", fontsize=9)
         grid[0, 1].set_title(f"last {CLOSE_S:g} s", fontsize=9)
         style.finish(figure, grid, "Attitude of a handheld instrument without a gyroscope")
     return figure
 
 
 def table(found: dict[str, Any]) -> str:
-    """The figures in words."""
+    """The results as text."""
     still = found["no_acceleration"]
     low, high = still["nees_interval"]
     drift = ", ".join(f"{v:.3g} deg after {at}" for at, v in found["rate_alone_deg"].items())
     return "\n".join(
         [
-            f"rate integrated alone: {drift}",
-            f"filter: {found['filter_deg']:.4f} deg rms; first part {found['filter_first_deg']:.4f},"
+            f"integrated rate: {drift}",
+            f"filter: {found['filter_deg']:.4f} deg RMS; first part {found['filter_first_deg']:.4f},"
             f" last part {found['filter_last_deg']:.4f}",
-            f"TRIAD alone: {found['triad_deg']:.4f} deg rms; the filter has"
-            f" {found['filter_deg'] / found['triad_deg']:.3f} of it",
+            f"TRIAD: {found['triad_deg']:.4f} deg RMS; error of the filter relative to it:"
+            f" {found['filter_deg'] / found['triad_deg']:.3f}",
             f"without acceleration: filter {still['filter_deg']:.4f}, TRIAD {still['triad_deg']:.4f} deg;"
             f" NEES {still['nees']:.4f}, true mean in {low:.4f} to {high:.4f} with"
             f" {100 * consistency.SURE:g} % ({still['independent_samples']:.0f} independent samples)",
@@ -272,10 +272,12 @@ def table(found: dict[str, Any]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=30.0, help="at least 0.5")
+    parser.add_argument(
+        "--minutes", type=float, default=30.0, help="duration, min, at least 0.5 (30)"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, help="file for the picture (PNG)")
-    parser.add_argument("--smoke", action="store_true", help="half a minute, nothing is asserted")
+    parser.add_argument("--output", type=Path, help="PNG file for the figure")
+    parser.add_argument("--smoke", action="store_true", help="half a minute, nothing is checked")
     arguments = parser.parse_args()
     if arguments.smoke:
         arguments.minutes = 0.5
@@ -299,7 +301,7 @@ def main() -> None:
     for text, passed in checks.items():
         print(f"{'ok    ' if passed else 'MISSED'} {text}")
     if arguments.output is not None:
-        print(f"picture: {style.save(picture(made[0]), arguments.output)}")
+        print(f"figure: {style.save(figure_of(made[0]), arguments.output)}")
     print(json.dumps(found | {"checks": checks}))
     sys.exit(0 if arguments.smoke or all(checks.values()) else 1)
 

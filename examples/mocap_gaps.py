@@ -1,12 +1,12 @@
-"""Real motion capture with stretches hidden, carried on through them by the real IMU.
+"""Real motion capture with hidden intervals, over which a real IMU extrapolates.
 
     python examples/mocap_gaps.py DIR [--rooms 1 3 4] [--hide 0.5 1 2]
 
-DIR holds TUM-VI rooms or EuRoC folders with a pose stream. From each recording stretches of poses are
-hidden; at the end of each the estimate is compared with the pose that was hidden there, beside holding the
-last pose and going on with its velocity. Real outliers of the motion capture stay in. The last line is
-JSON: medians over all hidden stretches, by length; the exit status is 1 where a figure is missed.
-`--smoke` hides one stretch in a short piece of one recording, and nothing is asserted.
+DIR has TUM-VI rooms or EuRoC folders with a pose stream. Intervals of poses are hidden in each recording.
+At the end of each interval the hidden pose is compared with the estimate and with two other predictions:
+the last pose held, and constant velocity. Real outliers of the motion capture are kept. The last line of
+the output is JSON with the medians over all hidden intervals by length; the exit status is 1 if an expected
+value is missed. `--smoke` hides one interval in a short piece of one recording, and nothing is checked.
 """
 
 import argparse
@@ -31,30 +31,29 @@ from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
 from jaxekf.calibration import time_offset
-from jaxekf.estimation.parameters import as_arrays
 from jaxekf.io.importers import asl
 from jaxekf.models import loose_pose
-from jaxekf.recordings.types import Flags, Floats, Optical, Times, to_scipy
+from jaxekf.recordings.types import Flags, Floats, Times, to_scipy
 
 SETTLE_S, BETWEEN_S = 8.0, 3.0
 FIT_S, FIT_FRAMES = 0.05, 3
 STEP_DEG, STEP_M = 1.0, 0.05
-"""A step from one frame to the next that differs by more from the gyroscope's, or is longer, is an
-outlier."""
+"""A step between frames is an outlier if its rotation differs from the gyroscope's by more than this, or if
+it is longer than this."""
 KNOWN_DEG = 0.3
-"""An alignment is corrected where it is known better than this."""
+"""An estimated alignment is used if its standard deviation is below this."""
 METHODS = ("estimate", "hold last", "constant velocity")
 
 
 class Gap(NamedTuple):
-    """A hidden stretch: its last visible frame and the hidden frame at its end."""
+    """A hidden interval: indices of the last visible frame and of its last hidden frame."""
 
     before: int
     end: int
 
 
 class Case(NamedTuple):
-    """One recording with one length of stretches hidden."""
+    """One recording with hidden intervals of one length."""
 
     name: str
     length_s: float
@@ -64,10 +63,10 @@ class Case(NamedTuple):
 
 
 def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
-    """Noise of a small MEMS IMU and of motion capture, the same for all: none of it is tuned to a room.
+    """Noise of a small MEMS IMU and of motion capture, the same for all recordings, without tuning.
 
-    Densities are several times a data sheet's: the gyroscope's scale and the lever arm are not calibrated
-    here. Clock and alignment are, from the poses that can be seen, where they turn enough to tell.
+    Densities are several times those of data sheets, because the gyroscope's scale and the lever arm are
+    not calibrated. Clock offset and alignment are estimated from the visible poses if these rotate enough.
     """
     params = loose_pose.MODEL.parameters
     noise = params.noise._replace(
@@ -82,16 +81,16 @@ def parameters_of(recording: jaxekf.Recording) -> jaxekf.Parameters:
     try:
         found = time_offset.match(recording.need_optical(), recording.need_imu(), recording.name)
     except jaxekf.RecordingError as error:
-        print(f"clock and alignment are taken as stated: {error}", file=sys.stderr)
+        print(f"clock and alignment are those of the recording: {error}", file=sys.stderr)
     else:
         calibration = calibration._replace(latency=np.array(found.latency_s))
         if found.alignment_sigma.max() < np.deg2rad(KNOWN_DEG):
             calibration = calibration._replace(alignment=found.alignment)
-    return as_arrays(params._replace(noise=noise, calibration=calibration))
+    return params._replace(noise=noise, calibration=calibration)
 
 
-def turning_off(recording: jaxekf.Recording) -> Floats:
-    """Degrees by which each step of the poses differs from the gyroscope's, (N - 1,)."""
+def rotation_error_deg(recording: jaxekf.Recording) -> Floats:
+    """Difference (N - 1,) in deg between the rotation of each step of the poses and the gyroscope's."""
     optical, imu = recording.need_optical(), recording.need_imu()
     taken = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / 1e9
     middle, span = 0.5 * (taken[1:] + taken[:-1]), np.diff(taken)
@@ -103,13 +102,12 @@ def turning_off(recording: jaxekf.Recording) -> Floats:
 
 
 def good_frames(recording: jaxekf.Recording) -> Flags:
-    """Frames that agree with both neighbours and do not repeat one: where the motion capture can be
-    believed."""
+    """Flags (N,) of frames that agree with both neighbours and do not repeat one."""
     optical = recording.need_optical()
     assert optical.position is not None
     step_m = np.linalg.norm(np.diff(optical.position, axis=0), axis=1)
     frozen = (step_m == 0.0) & (np.diff(optical.q_ref_body, axis=0) == 0.0).all(axis=1)
-    calm = (turning_off(recording) < STEP_DEG) & (step_m < STEP_M) & ~frozen
+    calm = (rotation_error_deg(recording) < STEP_DEG) & (step_m < STEP_M) & ~frozen
     good = optical.valid.copy()
     good[1:] &= calm
     good[:-1] &= calm
@@ -117,7 +115,7 @@ def good_frames(recording: jaxekf.Recording) -> Flags:
 
 
 def hide(recording: jaxekf.Recording, length_s: float) -> Case:
-    """Stretches of the length hidden one after the other, with time between them to settle."""
+    """Hide intervals of this length, with time between them for the filter to settle."""
     optical = recording.need_optical()
     good = good_frames(recording)
     t = optical.time_ns / 1e9
@@ -138,8 +136,10 @@ def hide(recording: jaxekf.Recording, length_s: float) -> Case:
     return Case(recording.name, length_s, gaps, recording, changed)
 
 
-def tracked_pose(made: jaxekf.Estimate, optical: Optical, at: Any) -> tuple[Floats, Rotation]:
-    """What the motion capture should have said at these instants: its point, and its own frame."""
+def tracked_pose(
+    made: jaxekf.Estimate, optical: jaxekf.Optical, at: Any
+) -> tuple[Floats, Rotation]:
+    """Estimated position of the tracked point and attitude of the tracked frame at these instants."""
     turn = to_scipy(made.attitude.value[at])
     point = np.zeros(3) if optical.p_body_tool is None else optical.p_body_tool
     frame = Rotation.from_rotvec(np.array(made.params.calibration.alignment))
@@ -147,7 +147,7 @@ def tracked_pose(made: jaxekf.Estimate, optical: Optical, at: Any) -> tuple[Floa
 
 
 def predictions(case: Case, made: jaxekf.Estimate, gap: Gap) -> dict[str, tuple[Floats, Rotation]]:
-    """Position of the tracked point and attitude at the end of a stretch, by each method."""
+    """Position of the tracked point and attitude at the end of an interval, by each method."""
     optical = case.original.need_optical()
     assert optical.position is not None
     at = int(np.searchsorted(made.time_ns, optical.time_ns[gap.end] - optical.latency_ns))
@@ -169,7 +169,7 @@ def predictions(case: Case, made: jaxekf.Estimate, gap: Gap) -> dict[str, tuple[
 
 
 def score(case: Case, made: jaxekf.Estimate) -> dict[str, list[tuple[float, float]]]:
-    """Position (mm) and attitude (deg) errors of each method, one for each stretch."""
+    """Position (mm) and attitude (deg) errors of each method, one for each interval."""
     optical = case.original.need_optical()
     assert optical.position is not None
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in METHODS}
@@ -182,7 +182,7 @@ def score(case: Case, made: jaxekf.Estimate) -> dict[str, list[tuple[float, floa
 
 
 def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, Any]:
-    """What became of the motion capture's own outliers, where nothing was hidden."""
+    """Motion-capture outliers in a recording without hidden intervals, and errors of the estimate."""
     optical = recording.need_optical()
     assert optical.position is not None
     good = good_frames(recording)
@@ -191,31 +191,31 @@ def outliers(recording: jaxekf.Recording, made: jaxekf.Estimate) -> dict[str, An
     point, turn = tracked_pose(made, optical, at)
     off = point - optical.position
     angle = np.rad2deg((turn.inv() * to_scipy(optical.q_ref_body)).magnitude())
-    judged = good & inside
+    scored = good & inside
     seen = optical.valid & inside
     both = seen[1:] & seen[:-1]
     record = made.sensors["optical"]
     return {
-        "outlier_steps": int((turning_off(recording) > STEP_DEG)[both].sum()),
+        "outlier_steps": int((rotation_error_deg(recording) > STEP_DEG)[both].sum()),
         "refused": int(record.gated.any(axis=1).sum()),
         "frames": len(record.time_ns),
-        "median_deg": float(np.median(angle[judged])),
-        "median_mm": 1e3 * float(np.median(np.linalg.norm(off[judged], axis=1))),
-        "largest_deg_1_in_100": float(np.quantile(angle[judged], 0.99)),
-        "largest_deg_1_in_1000": float(np.quantile(angle[judged], 0.999)),
+        "median_deg": float(np.median(angle[scored])),
+        "median_mm": 1e3 * float(np.median(np.linalg.norm(off[scored], axis=1))),
+        "largest_deg_1_in_100": float(np.quantile(angle[scored], 0.99)),
+        "largest_deg_1_in_1000": float(np.quantile(angle[scored], 0.999)),
         "largest_mm_1_in_1000": 1e3
-        * float(np.quantile(np.linalg.norm(off[judged], axis=1), 0.999)),
-        "median_deg_at_the_end": float(np.median(angle[np.flatnonzero(judged)[-100:]])),
+        * float(np.quantile(np.linalg.norm(off[scored], axis=1), 0.999)),
+        "median_deg_at_the_end": float(np.median(angle[np.flatnonzero(scored)[-100:]])),
     }
 
 
-def _nearest(times: Times, asked: Times) -> Any:
-    return np.clip(np.searchsorted(times, asked), 0, len(times) - 1)
+def _nearest(times: Times, wanted: Times) -> Any:
+    return np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
 
 
 def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Recording]:
-    """The recordings of a folder, only the rooms named where there are any; one that cannot be read is
-    left out with a sentence, unless none is left."""
+    """The recordings of a folder, or those of the named rooms. One that cannot be read is left out with a
+    message; if none is left, the script ends."""
     found = asl.find(folder)
     if not found:
         sys.exit(
@@ -236,7 +236,7 @@ def chosen_recordings(folder: Path, rooms: list[str] | None) -> list[jaxekf.Reco
             print(f"left out: {error}", file=sys.stderr)
     if not readable:
         sys.exit(
-            f"{folder}: got no recording that can be read, expected one; mend what is said above"
+            f"{folder}: got no recording that can be read, expected one; see the messages above"
         )
     return readable
 
@@ -248,14 +248,14 @@ def medians(errors: list[tuple[float, float]]) -> dict[str, float]:
 
 
 def label(recording: jaxekf.Recording, taken: dict[str, Any]) -> str:
-    """A name for the recording that no other has."""
+    """A unique name for the recording."""
     if recording.name not in taken:
         return recording.name
     return f"{recording.name} {len(taken) + 1}"
 
 
 def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool]:
-    """Each figure that must hold."""
+    """The checks of the expected values."""
     checks = {}
     if "1" in table:
         one = table["1"]
@@ -269,7 +269,7 @@ def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool
             half["estimate"]["mm"] <= 0.2 * half["constant velocity"]["mm"]
         )
     for name, found in outlying.items():
-        # A filter astray stays so for many frames; a single one of motion capture's may be wrong.
+        # A diverged filter is wrong for many frames, an outlier of the motion capture for one.
         checks[f"{name}: outliers do not make it diverge"] = (
             found["largest_deg_1_in_100"] < 2.0
             and found["median_deg_at_the_end"] < 1.0

@@ -1,10 +1,10 @@
-"""A model of your own, without editing the package: `loose` with a gyroscope scale error as a state.
+"""A user-defined model: `loose` with the gyroscope's scale error as an additional state.
 
-    python examples/own_model.py                        # estimates a bundled run with it
-    jaxekf estimate RUN --model own_model:MODEL         # from the folder this file is in
+    python examples/own_model.py                        # estimates a bundled run
+    jaxekf estimate RUN --model own_model:MODEL         # in the folder of this file
 
-A model is a state space, a transition with its process noise, and sensors. The Jacobians, the gradient
-for tuning, masks, plots and files follow from these.
+A model has a state space, a transition with its process noise, and sensors. Jacobians, the gradient for
+tuning, masks, figures and files follow from these.
 """
 
 import argparse
@@ -49,12 +49,12 @@ SPACE: Any = State(SO3(), Euclidean(3, "rad/s"), Euclidean(3, "1"))
 
 
 def rate(x: State, measured: jax.Array) -> jax.Array:
-    """Body rate, rad/s: the measured one without bias and scale error."""
+    """Body rate, rad/s: the measured rate corrected for bias and scale error."""
     return (measured - x.bias) / (1.0 + x.scale)
 
 
 def transition(x: State, u: InputSample, dt: Any, w: jax.Array, params: Parameters) -> State:
-    """The attitude turns by the mean rate over the step; bias and scale walk."""
+    """The attitude rotates by the mean rate over the step; bias and scale error are random walks."""
     turn = rate(x, u.mean) * dt + w[:3]
     return State(SO3().retract(x.q_ref_body, turn), x.bias + w[3:6], x.scale + w[6:])
 
@@ -73,7 +73,7 @@ def initial_covariance(params: Parameters) -> jax.Array:
 
 
 def initial_mean(first: Any) -> State:
-    """The first visible attitude; no bias, no scale error."""
+    """The first visible attitude, zero bias and zero scale error."""
     return State(jnp.asarray(first["optical"]), jnp.zeros(3), jnp.zeros(3))
 
 
@@ -114,7 +114,7 @@ MODEL = Model(
             Euclidean(3, "rad/s"),
             "body",
             value=lambda x, u, params: rate(x, u.value),
-            # What is not in the state: the white noise of the gyroscope's own sample.
+            # The white noise of the gyroscope sample is not part of the state.
             noise=lambda u, params: linalg.covariance(params.noise.gyroscope, 3) * u.bandwidth,
         ),
     ),
@@ -122,13 +122,13 @@ MODEL = Model(
 
 
 def main() -> None:
-    from jaxekf.simulation import demo
-
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--smoke", action="store_true", help="the same: it takes seconds")
+    parser.add_argument(
+        "--smoke", action="store_true", help="no effect, since the script takes seconds"
+    )
     parser.parse_args()
     jaxekf.set_up()
-    run = jaxekf.load(demo.FOLDER / "free-5")
+    run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
     estimate = jaxekf.estimate(run, MODEL)
     scale = estimate.part("scale")
     print(f"attitude RMSE {jaxekf.score(estimate, run).attitude_rmse_deg:.3f} deg")

@@ -6,31 +6,29 @@ import os
 import sys
 from pathlib import Path
 
-from jaxekf.recordings.types import NANOSECONDS, Recording
+from jaxekf import Recording
 
 DATA = Path(os.environ.get("JAXEKF_DATA", Path(__file__).parents[2] / "shared" / "data"))
-"""The folder that `--smoke` looks for data in."""
+"""Folder of the recorded data for `--smoke`."""
 
 
 def parse(parser: argparse.ArgumentParser, name: str) -> argparse.Namespace:
-    """The arguments, with `folder` and `smoke` among them.
+    """Parse the arguments, with `folder` and `smoke` added to them.
 
-    With ``--smoke`` the folder may be left out: it is then `name` in `DATA`, and the script ends with a
-    sentence where that is not there.
+    With ``--smoke`` the folder is `name` in `DATA` unless given; if there is none, the script ends with a
+    message.
     """
-    parser.add_argument("folder", type=Path, nargs="?", help="the recordings")
-    parser.add_argument(
-        "--smoke", action="store_true", help="one short piece, to see that the script ends"
-    )
+    parser.add_argument("folder", type=Path, nargs="?", help="folder of the recordings")
+    parser.add_argument("--smoke", action="store_true", help="a short piece of the data")
     arguments = parser.parse_args()
     if arguments.folder is None and not arguments.smoke:
-        parser.error("got no folder, expected the one that holds the recordings")
+        parser.error("got no folder, expected the folder of the recordings")
     if arguments.folder is None:
         arguments.folder = DATA / name
         if not arguments.folder.is_dir():
             sentence = (
                 f"There is no recorded data in {arguments.folder}; set JAXEKF_DATA to the folder that"
-                f" holds {name}."
+                f" has {name}."
             )
             print(json.dumps({"skipped": sentence}))
             sys.exit(0)
@@ -39,8 +37,8 @@ def parse(parser: argparse.ArgumentParser, name: str) -> argparse.Namespace:
 
 def piece(recording: Recording, start_s: float, seconds: float) -> Recording:
     """The recording from `start_s` after its IMU's first sample, `seconds` long."""
-    begin = int(recording.need_imu().time_ns[0]) + int(start_s * NANOSECONDS)
-    end = begin + int(seconds * NANOSECONDS)
+    begin = int(recording.need_imu().time_ns[0]) + int(start_s * 1e9)
+    end = begin + int(seconds * 1e9)
     streams = {
         label: stream.take((stream.time_ns >= begin) & (stream.time_ns < end))
         for label, stream in recording.streams.items()

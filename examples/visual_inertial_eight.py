@@ -1,13 +1,13 @@
-"""A camera and an IMU that draw an eight before a scene (Hol 2008): fused, and by images alone.
+"""A camera and an IMU that move along a figure eight in front of a scene (Hol 2008).
 
     python examples/visual_inertial_eight.py [--seeds 20] [--figure eight.png] [--smoke]
 
-At 25, 12.5, 6 and 3 images a second the errors of the fused estimate stand beside those of the pose of each
-image by itself (PnP), at the images; then how far the estimate drifts in two seconds without images, with
-gravity in the scene as it is, found from images and accelerometer, and 1 deg off. The figure shows the
-eight, the two seconds, and where landmarks are looked for in the image after them. The last line is JSON;
-the exit status is 1 where images alone are better at some rate. With --smoke one run at one rate is
-estimated, without drift and figure, and nothing is asserted.
+The errors of the fused estimate are compared with those of the pose of each image alone (PnP), at 25, 12.5,
+6 and 3 images per second. Then the drift in two seconds without images is evaluated, with the true gravity
+vector in the scene, with the one estimated from images and accelerometer, and with one that is 1 deg off.
+The figure shows the path, the drift, and the search regions of the landmarks in the image after it. The
+last line of the output is JSON; the exit status is 1 if images alone are better at some rate. With --smoke
+one run at one rate is estimated, without drift and figure, and nothing is checked.
 """
 
 import argparse
@@ -33,11 +33,10 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from jaxekf.filtering.model import Belief
 from jaxekf.models import search_regions
 from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.truth import encoder_at
-from jaxekf.recordings.types import Floats, Recording, Times, to_scipy
+from jaxekf.recordings.types import Floats, Times, to_scipy
 from jaxekf.reporting.plots import style
 from jaxekf.simulation.camera_runs import IMAGE, CameraGrade, camera_recording
 
@@ -57,7 +56,7 @@ class Errors(NamedTuple):
     """(N,) rad^2."""
 
 
-def errors(time_ns: Times, position: Floats, q: Floats, run: Recording) -> Errors:
+def errors(time_ns: Times, position: Floats, q: Floats, run: jaxekf.Recording) -> Errors:
     """Squared errors of poses at these instants."""
     at = encoder_at(run.need_encoder(), time_ns)
     assert at.position is not None
@@ -66,18 +65,18 @@ def errors(time_ns: Times, position: Floats, q: Floats, run: Recording) -> Error
 
 
 def joined(found: list[Errors]) -> Errors:
-    """Those of all runs."""
+    """The errors of all runs in one."""
     return Errors(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def rms(found: Errors) -> tuple[float, float]:
-    """Root mean squares, mm and deg."""
+    """RMS of position in mm and of attitude in deg."""
     position, attitude = (float(np.sqrt(np.mean(part))) for part in found)
     return 1e3 * position, float(np.rad2deg(attitude))
 
 
-def runs_at(rate_hz: float, seeds: int, **changes: Any) -> list[Recording]:
-    """A run of each seed."""
+def runs_at(rate_hz: float, seeds: int, **changes: Any) -> list[jaxekf.Recording]:
+    """Simulate one run for each seed."""
     grade = CameraGrade(camera_hz=rate_hz)
     return [
         camera_recording(f"eight-{seed}", seed=seed, duration_s=SECONDS, grade=grade, **changes)
@@ -85,8 +84,8 @@ def runs_at(rate_hz: float, seeds: int, **changes: Any) -> list[Recording]:
     ]
 
 
-def compared(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], list[Any]]:
-    """Errors of both at the images after `SETTLED_S`; and the estimates."""
+def compared(runs: list[jaxekf.Recording]) -> tuple[dict[str, tuple[float, float]], list[Any]]:
+    """RMSE of the fused estimate and of images alone, at images after `SETTLED_S`; and the estimates."""
     made = jaxekf.estimate_many(runs, "visual")
     fused, alone = [], []
     for run, one in zip(runs, made, strict=True):
@@ -102,8 +101,8 @@ def compared(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], lis
     return {"fused": rms(joined(fused)), "images alone": rms(joined(alone))}, made
 
 
-def drift(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], list[Any]]:
-    """Errors so many seconds after the last image."""
+def drift(runs: list[jaxekf.Recording]) -> tuple[dict[str, tuple[float, float]], list[Any]]:
+    """RMSE at each time in `DRIFT_S` after the last image; and the estimates."""
     made = jaxekf.estimate_many(runs, "visual")
     found = {}
     for after in DRIFT_S:
@@ -119,8 +118,8 @@ def drift(runs: list[Recording]) -> tuple[dict[str, tuple[float, float]], list[A
     return found, made
 
 
-def with_gravity(runs: list[Recording], turn: Rotation | None) -> list[Recording]:
-    """The runs with gravity said to be turned so; with None nothing is said of it, and it is found."""
+def with_gravity(runs: list[jaxekf.Recording], turn: Rotation | None) -> list[jaxekf.Recording]:
+    """The runs with a rotated gravity vector; with None without one, so that it is estimated."""
     changed = []
     for run in runs:
         info = dict(run.info)
@@ -131,23 +130,22 @@ def with_gravity(runs: list[Recording], turn: Rotation | None) -> list[Recording
     return changed
 
 
-def searched(run: Recording) -> tuple[search_regions.Regions, Floats]:
-    """Where the points of the first image after the gap are expected before it is looked at, and where they
-    are found."""
+def searched(run: jaxekf.Recording) -> tuple[search_regions.Regions, Floats]:
+    """The search regions of the landmarks in the first image after the gap, and their pixels (M, 2)."""
     camera = run.need_camera()
     image = int(np.searchsorted(camera.time_ns, camera.time_ns[0] + int(BLIND[1] * 1e9)))
     hidden = camera.visible.copy()
     hidden[image:] = False
     one = jaxekf.estimate(run.replace(camera=replace(camera, visible=hidden)), "visual")
     there = int(np.searchsorted(one.time_ns, camera.time_ns[image]))
-    ahead = Belief(jax.tree.map(lambda a: a[there], one.state), one.cov[there])
+    ahead = jaxekf.Belief(jax.tree.map(lambda a: a[there], one.state), one.cov[there])
     seen = camera.usable[image]
     found = search_regions.search_regions(one.params, ahead, camera.p_ref_landmark[seen])
     return found, camera.pixel[image, seen]
 
 
-def draw_searched(axes: Any, run: Recording) -> None:
-    """The image after the gap: points, and the ellipses within which they were looked for."""
+def draw_searched(axes: Any, run: jaxekf.Recording) -> None:
+    """Draw the image after the gap: landmarks, and the ellipses of their search regions."""
     found, pixel = searched(run)
     half, angle = search_regions.ellipses(found)
     for centre, axis, turn in zip(np.asarray(found.pixel), half, angle, strict=True):
@@ -155,17 +153,16 @@ def draw_searched(axes: Any, run: Recording) -> None:
         ellipse.set(fill=False, edgecolor=style.ESTIMATE, lw=1.0)
         axes.add_patch(ellipse)
     axes.plot([], [], color=style.ESTIMATE, lw=1.0, label="99 % search region")
-    axes.plot(*pixel.T, ".", color=style.MEASURED, ms=4, label="found")
+    axes.plot(*pixel.T, ".", color=style.MEASURED, ms=4, label="landmark")
     axes.set(
         xlim=(0, IMAGE[0]), ylim=(IMAGE[1], 0), aspect="equal", xlabel="u (px)", ylabel="v (px)"
     )
-    axes.set(title="the first image after the gap")
+    axes.set(title="first image after the gap")
     axes.legend(fontsize=8, loc="lower left")
 
 
-def figure(run: Recording, one: Any) -> Any:
-    """The eight as it was, by images alone, and as estimated; the height over time with its band; and the
-    image after the gap."""
+def figure(run: jaxekf.Recording, one: Any) -> Any:
+    """A figure of the path, of the error of the height over time, and of the image after the gap."""
     drawn, axes = style.new_grid(1, 3, (15.0, 4.2))
     path, over, image = axes[0]
     draw_searched(image, run)
@@ -183,10 +180,10 @@ def figure(run: Recording, one: Any) -> Any:
     path.plot(*at.position[:, 1::-1].T, color=style.TRUTH, lw=1.0, label="truth")
     path.plot(*place[:, 1::-1].T, color=style.ESTIMATE, lw=1.0, label="fused")
     path.legend(fontsize=8, loc="upper center")
-    path.set(xlabel="y (m)", ylabel="x, up (m)", title="the eight", aspect="equal")
+    path.set(xlabel="y (m)", ylabel="x, up (m)", title="path", aspect="equal")
     seconds = (run.need_camera().time_ns - one.time_ns[0]) / 1e9
     truth = at.position[:, 0]
-    style.band(over, one.time, 1e3 * (place[:, 0] - truth), 1e3 * sigma[:, 0], "2 sigma")
+    style.band(over, one.time, 1e3 * (place[:, 0] - truth), 1e3 * sigma[:, 0], "2σ of the estimate")
     over.plot(one.time, 1e3 * (place[:, 0] - truth), color=style.ESTIMATE, lw=1.0, label="fused")
     here = np.clip(np.searchsorted(one.time_ns, run.need_camera().time_ns), 0, len(truth) - 1)
     off = 1e3 * (raw.position[:, 0] - truth[here])
@@ -195,9 +192,7 @@ def figure(run: Recording, one: Any) -> Any:
     )
     begin, end = BLIND
     over.axvspan(begin, end, color=style.HIDDEN, alpha=0.6, lw=0, label="no images")
-    over.set(
-        xlabel="time (s)", ylabel="error of x, up (mm)", title="with two seconds without images"
-    )
+    over.set(xlabel="time (s)", ylabel="error of x, up (mm)", title="two seconds without images")
     over.set_ylim(-150.0, 150.0)
     over.legend(ncols=2, fontsize=8)
     return drawn
@@ -212,11 +207,11 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def drifts(seeds: int, file: Path) -> dict[str, dict[str, tuple[float, float]]]:
-    """The drift without images with each gravity; the first run's figure goes to the file."""
+    """The drift without images for each gravity vector; writes the figure of the first run."""
     runs = runs_at(12.5, seeds, blind=(BLIND,))
     drifted = {}
-    drifted["as it is"], made = drift(runs)
-    drifted["found"], _ = drift(with_gravity(runs, None))
+    drifted["true"], made = drift(runs)
+    drifted["estimated"], _ = drift(with_gravity(runs, None))
     off = Rotation.from_rotvec(np.deg2rad([0.0, 1.0, 0.0]))
     drifted["1 deg off"], _ = drift(with_gravity(runs, off))
     style.save(figure(runs[0], made[0]), file)
@@ -234,7 +229,7 @@ def main() -> None:
         found[f"{rate:g}"] = compared(runs_at(rate, arguments.seeds))[0]
     drifted = {} if arguments.smoke else drifts(arguments.seeds, arguments.figure)
     console = Console()
-    table = Table("images a second", "fused", "images alone", title="RMSE, mm and deg")
+    table = Table("images per second", "fused", "images alone", title="RMSE, mm and deg")
     for rate, both in found.items():
         table.add_row(rate, *(f"{mm:.1f} mm, {deg:.3f} deg" for mm, deg in both.values()))
     console.print(table)

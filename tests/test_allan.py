@@ -236,7 +236,7 @@ def test_command_takes_a_plain_log(tool, tmp_path):
     log = tmp_path / "lying" / "imu.csv"
     result = call("allan", log, "--from", 2, "--to", 12, "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    assert "rests from 2.0 to 12.0 s, 5001 samples" in result.output
+    assert "static from 2.0 to 12.0 s, 5001 samples" in result.output
     assert "Gyroscope at rest" in result.output and "below" in result.output
     short = call("allan", log, "--to", 1, "-o", tmp_path / "other")
     assert short.exit_code == 1 and "at rest, without gaps" in short.output

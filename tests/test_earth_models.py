@@ -219,7 +219,7 @@ def test_no_start_without_two_directions(runs):
 def test_figures_without_a_tracker(found, runs, tmp_path):
     """Would catch models of which nothing is drawn, or whose figures need what a run has not."""
     run = runs[0].replace(optical=None)
-    names = plots.possible_figures(found[0], run)
+    names = plots.available_figures(found[0], run)
     assert {"attitude", "rate", "bias"} <= set(names) and "occlusion" not in names
     for name in names:
         for seen in (run, run.replace(encoder=None)):

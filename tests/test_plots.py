@@ -13,14 +13,14 @@ def made():
     return jaxekf.estimate(record), record
 
 
-LOOSE = ("attitude", "rate", "bias", "occlusion", "path")
+LOOSE = ("attitude", "bias", "occlusion", "path", "rate")
 
 
 def test_what_a_model_of_attitude_shows(made):
     """Would catch a figure of what the model does not have, or one that is left out."""
-    assert plots.possible_figures(*made) == LOOSE
+    assert plots.available_figures(*made) == LOOSE
     alone = tuple(name for name in LOOSE if name != "occlusion")
-    assert plots.possible_figures(made[0], made[1].replace(optical=None)) == alone
+    assert plots.available_figures(made[0], made[1].replace(optical=None)) == alone
 
 
 @pytest.mark.parametrize("truth", [True, False])

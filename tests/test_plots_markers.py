@@ -12,21 +12,21 @@ from jaxekf.recordings.truth import encoder_velocity_at
 from jaxekf.recordings.types import Encoder, Optical
 from jaxekf.reporting import plots
 from jaxekf.reporting.plots import _attitudes as attitudes
-from jaxekf.reporting.plots import _sight as sight
+from jaxekf.reporting.plots import _measurements as measurements
 from jaxekf.reporting.plots import _single_markers as single_markers
 from jaxekf.simulation import marker_runs
 from jaxekf.simulation.marker_runs import ToolGrade
 
 NAMES = (
     "attitude",
-    "position",
-    "velocity",
-    "rate",
     "bias",
+    "innovations",
     "occlusion",
     "path",
+    "position",
+    "rate",
+    "velocity",
     "visibility",
-    "innovations",
 )
 REFUSED = (20, 40, 60)
 """Frames in which marker 1 is 2 cm off."""
@@ -67,9 +67,10 @@ def curve(axes, label):
 
 def test_what_is_shown(made):
     """Would catch markers of which there is no picture, as when only optical.csv counts."""
-    assert plots.possible_figures(*made) == NAMES
+    assert plots.available_figures(*made) == NAMES
     lone = replace(made[0], sensors={})
-    assert plots.possible_figures(lone, made[1]) == NAMES[:-2]
+    rest = tuple(name for name in NAMES if name not in ("innovations", "visibility"))
+    assert plots.available_figures(lone, made[1]) == rest
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -129,7 +130,7 @@ def test_what_is_missing_is_left_out(made, tmp_path):
 
 def test_stretches_without_pose(made):
     """Would catch shading of the wrong stretch, or one that a hole of one frame makes."""
-    view = sight.look(*made)
+    view = measurements.pose_measurements(*made)
     (lost,), (blind,) = view.lost, view.blind
     np.testing.assert_allclose(lost, (1.494, 2.25), atol=0.01)
     np.testing.assert_allclose(blind, (1.998, 2.25), atol=0.01)
@@ -137,7 +138,7 @@ def test_stretches_without_pose(made):
     seen = made[1].markers.visible.copy()
     seen[30], seen[130:] = False, False
     ends = made[1].replace(markers=replace(made[1].markers, visible=seen))
-    (_, last) = sight.look(made[0], ends).blind
+    (_, last) = measurements.pose_measurements(made[0], ends).blind
     np.testing.assert_allclose(last, (129 * 0.018, made[0].time[-1]), atol=1e-9)
 
 
@@ -145,14 +146,14 @@ def test_visibility_accounts_for_every_frame(made, figures):
     """Would catch a refused sample shown as used or hidden, or a frame counted twice."""
     frames = made[1].markers.time_ns - made[1].markers.latency_ns
     for name, record in single_markers.marker_sensors(*made).items():
-        fate = single_markers._fate(frames, record)
-        assert np.all(np.sum(fate, axis=0) == 1)
+        usage = single_markers._usage(frames, record)
+        assert np.all(np.sum(usage, axis=0) == 1)
         at = made[1].markers.names.index(name)
-        np.testing.assert_array_equal(fate.hidden, ~made[1].markers.visible[:, at])
+        np.testing.assert_array_equal(usage.hidden, ~made[1].markers.visible[:, at])
         if name == "1":
-            assert fate.refused[list(REFUSED)].all()
+            assert usage.refused[list(REFUSED)].all()
         account = made[0].account[f"marker_{name}"]
-        assert fate.refused.sum() == account["gated"]
+        assert usage.refused.sum() == account["gated"]
     texts = [text.get_text() for text in figures["visibility"].axes[0].texts]
     hidden = 100.0 * np.mean(~made[1].markers.visible, axis=0)
     assert all(f"{share:.1f} % hidden" in text for share, text in zip(hidden, texts, strict=True))
@@ -180,7 +181,7 @@ def test_a_pose_is_told_of_the_origin():
         p_body_tool=np.array([0.5, 0.0, 0.0]),
         latency_ns=1_000,
     )
-    plain = sight.at_origin(raw)
+    plain = measurements.at_origin(raw)
     assert plain.time_ns[0] == 4_000
     np.testing.assert_allclose(plain.position, [[1.0, 1.5, 3.0]], atol=1e-12)
     assert (plain.latency_ns, plain.p_body_tool) == (0, None)

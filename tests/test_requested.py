@@ -109,7 +109,7 @@ def test_what_lies_outside_is_said():
     times = np.sort(np.append(outside, whole.time_ns[10]))
     made = jaxekf.estimate(RUN, at=times)
     assert list(made.requested.time_ns) == [whole.time_ns[10]]
-    assert any("2 of 3 requested times lie outside the run" in note for note in made.notes)
+    assert any("2 of 3 requested times are outside the run" in note for note in made.notes)
     for bad, words in (
         (outside, "expected some within the run"),
         (np.array([0.5, 0.7]), "expected int64 nanoseconds"),

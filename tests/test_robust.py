@@ -201,7 +201,7 @@ def test_what_a_result_tells(tmp_path):
     )
     spoilt = run.replace(optical=dataclasses.replace(run.optical, q_ref_body=wrong))
     made = jaxekf.estimate(spoilt, jaxekf.robust("loose", "student"))
-    assert any("count less than half" in note for note in made.notes)
+    assert any("robust weight below 0.5" in note for note in made.notes)
     assert made.summary()["outliers"] == {"optical": {"gate": None, "weighting": "student"}}
     head = (made.save(tmp_path / "r") / "innovations_optical.csv").read_text().splitlines()[0]
     assert "weight_x" in head

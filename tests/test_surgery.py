@@ -224,7 +224,7 @@ def test_claims_of_the_example(example, runs):
 
 def test_picture_of_the_example(example, runs, tmp_path):
     """An axis without unit or curve, a picture that is not written."""
-    figure = example.picture(runs[0])
+    figure = example.figure_of(runs[0])
     for axes in figure.axes:
         assert "(deg)" in axes.get_ylabel()
         assert len(axes.get_lines()) >= 2

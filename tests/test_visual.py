@@ -26,7 +26,7 @@ from jaxekf.pose_solvers import pnp
 from jaxekf.recordings.truth import encoder_at
 from jaxekf.recordings.types import from_scipy, to_scipy
 from jaxekf.reporting import plots
-from jaxekf.reporting.plots import _sight as sight
+from jaxekf.reporting.plots import _measurements as measurements
 from jaxekf.simulation import attitude_runs, camera_runs
 from jaxekf.simulation.camera_runs import CameraGrade, camera_recording
 from tuning.comparison.compare import _tracker_nis as tracker_nis
@@ -366,8 +366,8 @@ def test_figures_of_a_camera(tmp_path):
     blind = ((1.5, 2.0),)
     run = camera_recording("run", seed=2, duration_s=SECONDS, grade=few(), blind=blind)
     made = jaxekf.estimate(run, "visual")
-    names = plots.possible_figures(made, run)
-    assert names == ("attitude", "position", "velocity", "rate", "bias", "occlusion", "path")
+    names = plots.available_figures(made, run)
+    assert names == ("attitude", "bias", "occlusion", "path", "position", "rate", "velocity")
     for name in names:
         figure = plots.figure_functions()[name](made, run)
         plots.save(figure, tmp_path / f"{name}.png")
@@ -380,11 +380,11 @@ def test_figures_of_a_camera(tmp_path):
             assert "no landmark" in said
     begin, end = plots.longest_gap(run, made)
     assert end - begin == pytest.approx(0.5, abs=0.1)
-    whole = sight.look(made, run)
+    whole = measurements.pose_measurements(made, run)
     thin = run.replace(camera=replace(run.camera))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sight, "_MOST_IMAGES", 20)
-        shown = sight.look(made, thin)
+        patch.setattr(measurements, "_MOST_IMAGES", 20)
+        shown = measurements.pose_measurements(made, thin)
         assert plots.longest_gap(thin, made) == (begin, end)
     assert 0 < len(shown.t) <= 20 < len(whole.t)
     assert (shown.lost, shown.blind) == (whole.lost, whole.blind)

@@ -1,6 +1,6 @@
-"""Foundations without knowledge of filtering: errors, lazy imports, compilation, memory, quantiles.
+"""Support without filtering: errors, lazy imports, compilation, memory, deprecated names, chi-square.
 
-Every room may import from here, and this room imports none. A user finds `JaxekfError` and its kinds,
-`jit`, `set_up` and `keep_programs` in `jaxekf` itself. Add here only what several rooms need and none
-of them owns.
+Every package may import from here, and this package imports none of them. Users import `JaxekfError` and
+its subclasses, `jit`, `set_up` and `keep_programs` from `jaxekf`. A file belongs here only if several
+packages need it and none of them owns it.
 """

@@ -1,7 +1,7 @@
-"""The chi-square distribution, with the numbers of `scipy.stats`.
+"""The chi-square distribution, with the same results as `scipy.stats.chi2`.
 
-`scipy.stats` takes most of a second to import, half of what this whole package does; the special
-functions behind it take none. Degrees of freedom that are not positive give NaN, as there.
+The import of `scipy.stats` takes most of a second, that of `scipy.special` almost none. Degrees of freedom
+that are not positive give NaN, as in SciPy.
 """
 
 from typing import Any
@@ -10,18 +10,18 @@ import numpy as np
 from scipy.special import chdtr, chdtrc, gammaincinv
 
 
-def ppf(share: Any, degrees: Any) -> Any:
-    """The bound that a share of values stays below."""
-    return 2.0 * gammaincinv(_positive(degrees) / 2.0, share)
+def ppf(probability: Any, degrees: Any) -> Any:
+    """The quantile: the value that is exceeded with one minus this probability."""
+    return 2.0 * gammaincinv(_positive(degrees) / 2.0, probability)
 
 
 def cdf(value: Any, degrees: Any) -> Any:
-    """The probability of less than `value`."""
+    """The probability of a smaller value."""
     return chdtr(_positive(degrees), np.maximum(value, 0.0))
 
 
 def sf(value: Any, degrees: Any) -> Any:
-    """The probability of more than `value`."""
+    """The probability of a larger value."""
     return chdtrc(_positive(degrees), np.maximum(value, 0.0))
 
 

@@ -1,4 +1,4 @@
-"""How JAX and its compiler are set for the filter's programs."""
+"""Settings of JAX and of its compiler for the filter's programs."""
 
 import gc
 import os
@@ -8,17 +8,17 @@ from typing import Any
 import jax
 
 KEEPS_BARRIERS = jax.__version_info__ >= (0, 11)
-"""Whether XLA on a CPU fuses nothing across a barrier; before, it took barriers away first."""
+"""Whether XLA on a CPU respects optimisation barriers in fusion; older versions remove them first."""
 
-# Before JAX 0.11 XLA makes each loop by MLIR, which takes twice as long and gives slower programs; later
-# versions do not have the choice.
+# Before JAX 0.11 XLA can generate loops with or without MLIR; with it, compilation takes twice as long and
+# programs are slower. Later versions have no such option.
 _COMMON: dict[str, Any] = {} if KEEPS_BARRIERS else {"xla_cpu_use_fusion_emitters": False}
-# On a CPU less to compile than at level 3, and loops over runs 10 to 20 % quicker.
+# On a CPU, compilation is faster than at level 3, and loops over runs are 10 to 20 % faster.
 FAST: dict[str, Any] = _COMMON | {
     "xla_backend_optimization_level": 2,
     "xla_cpu_prefer_vector_width": 512,
 }
-# A third to two thirds less to compile, for slower programs: `JAXEKF_COMPILE=quick`.
+# Compilation takes a third to two thirds less time, for slower programs: `JAXEKF_COMPILE=quick`.
 QUICK: dict[str, Any] = _COMMON | {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
@@ -26,24 +26,26 @@ QUICK: dict[str, Any] = _COMMON | {
 _COMPILER_OPTIONS = QUICK if os.environ.get("JAXEKF_COMPILE") == "quick" else FAST
 
 _OBJECTS = 50_000
-"""New objects at which Python looks for garbage."""
+"""Number of new objects after which Python runs its garbage collector."""
 _EXTRA = "xla_backend_extra_options"
 _NO_UNROLLING = f"--{_EXTRA}=xla_cpu_disable_loop_unrolling"
 
 
 def set_up() -> None:
-    """Set JAX up for estimation: numbers of 64 bits, on a CPU a compiler that leaves loops whole, and a
-    garbage collector that looks less often.
+    """Set up JAX for estimation: float64, no loop unrolling on a CPU, and less frequent garbage collection.
 
-    Call it first, before JAX makes an array: XLA reads its flags, ``XLA_FLAGS``, once. It applies to every
-    program of the process and to the processes that it starts. Without the flag results are the same but
-    for rounding, and come later: a step of the filter is hundreds of loops over a few numbers of many runs
-    each, and unrolled they take up to twice as long to compile and run up to 1.6 times as long. (To
-    compare, run ``benchmarks/speed.py`` with ``XLA_FLAGS=--xla_backend_extra_options=xla_none``: flags that
-    set this option are left as they are. XLA takes it from the flags only.)
+    Call it before the first JAX array, because XLA reads the environment variable ``XLA_FLAGS`` only once.
+    It applies to the whole process and to the processes that it starts.
 
-    Tracing makes many objects, none of them garbage; with Python's own thresholds looking at them takes a
-    third of its time.
+    Notes
+    -----
+    Loop unrolling changes results only by rounding. A step of the filter has hundreds of short loops;
+    unrolled, they take up to twice as long to compile and 1.6 times as long to run. To compare, run
+    ``benchmarks/speed.py`` with ``XLA_FLAGS=--xla_backend_extra_options=xla_none``: flags that already set
+    this option are not changed. XLA reads it from the flags only.
+
+    Tracing creates many objects, none of them garbage; with Python's default threshold the garbage
+    collector takes a third of the time of tracing.
     """
     jax.config.update("jax_enable_x64", True)
     objects, *generations = gc.get_threshold()
@@ -55,9 +57,20 @@ def set_up() -> None:
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Any:
-    """`jax.jit` with the compiler settings that suit the filter, and the same `options`.
+    """`jax.jit` with the compiler options for the filter.
 
-    JAX takes compiler settings for outermost calls only: inside another `jit` use `jax.jit`.
+    Parameters
+    ----------
+    function
+        The function to compile. It must not be called inside another compiled function, since JAX accepts
+        compiler options for outermost calls only; there use `jax.jit`.
+    **options
+        Options of `jax.jit`, such as ``static_argnums``.
+
+    Returns
+    -------
+    Callable
+        The compiled function.
     """
     settings: dict[str, Any] = {"compiler_options": _COMPILER_OPTIONS}
     return jax.jit(function, **(settings | options))

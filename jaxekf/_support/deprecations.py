@@ -70,7 +70,7 @@ _ROOMS = {
     "jaxekf.reporting": "plots report",
     "jaxekf.reporting.plots": (
         "plots.attitudes>_attitudes plots.biases>_biases plots.deviations plots.paths>_paths "
-        "plots.sight>_sight plots.single_markers>_single_markers plots.style plots.timeaxis "
+        "plots.sight>_measurements plots.single_markers>_single_markers plots.style plots.timeaxis "
         "plots.vectors>_vectors"
     ),
     "jaxekf.reporting.report": (

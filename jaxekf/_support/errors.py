@@ -1,14 +1,14 @@
-"""Errors a caller can meet. Each message says what was got, what was expected and what to do."""
+"""Errors and warnings of the package. Each message has what was got, what was expected and what to do."""
 
 from pathlib import Path
 
 
 class JaxekfError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base class of all errors of this package."""
 
 
 class RecordingError(JaxekfError):
-    """A recorded run cannot be read, or does not hold what its description says."""
+    """A recorded run cannot be read, or its data do not fit its description."""
 
     def __init__(
         self,
@@ -22,21 +22,21 @@ class RecordingError(JaxekfError):
     ) -> None:
         self.path, self.line, self.column = Path(path), line, column
         place = ":".join(str(part) for part in (path, line, column) if part is not None)
-        told = f"{place}: got {got}, expected {expected}; try {hint}"
-        # Names and texts of a damaged file may hold anything: the message is one line that can be printed.
-        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in told))
+        message = f"{place}: got {got}, expected {expected}; try {hint}"
+        # The text of a damaged file may hold any characters; the message is one printable line.
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
 
 
 class ModelError(JaxekfError):
-    """A model is unknown, malformed, or does not fit the recording."""
+    """A model is unknown, is not valid, or does not fit the recording."""
 
 
 class PrecisionError(JaxekfError):
-    """JAX is running in float32, in which the covariance recursion is not trustworthy."""
+    """JAX is set to float32, which is not accurate enough for the covariance recursion."""
 
 
 class FilterError(JaxekfError):
-    """The recursion lost finiteness or definiteness; the message names run, step, time and sensor."""
+    """A covariance is no longer finite and positive definite; the message has run, step and sensor."""
 
 
 class TuningError(JaxekfError):
@@ -44,17 +44,17 @@ class TuningError(JaxekfError):
 
 
 class ResourceError(JaxekfError):
-    """There is too little memory for what was asked; the message names the run."""
+    """There is too little memory; the message has the name of the run."""
 
 
 class CacheError(JaxekfError):
-    """Compiled programs cannot be kept in the folder that the message names."""
+    """The folder for compiled programs cannot be written; the message has its path."""
 
 
 class MissingPackageError(JaxekfError):
-    """What was asked needs a package that is not installed; the message says how to install it."""
+    """A required package is not installed; the message has the command that installs it."""
 
 
 class SlowModelWarning(UserWarning):
-    """A model's function is right but does not become plain arithmetic for many runs at once; the message
-    names the operation."""
+    """A model's function cannot be lowered to batched arithmetic and is slow; the message has the
+    operation."""

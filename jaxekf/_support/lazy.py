@@ -1,7 +1,6 @@
 """Public names of a package that are imported when they are first used (PEP 562).
 
-A package that imports everything costs seconds before the first line of work is done, also for
-somebody who wants its version or one function.
+Importing all modules takes seconds, also for a user who needs only the version or one function.
 """
 
 import sys
@@ -40,7 +39,7 @@ def attributes(
             value = import_module(f"{package}.{name}")
         else:
             raise AttributeError(f"module '{package}' has no attribute '{name}'", name=name)
-        # From now on found without coming here.
+        # Python does not call `__getattr__` for this name again.
         setattr(sys.modules[package], name, value)
         return value
 

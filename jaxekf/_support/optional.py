@@ -1,4 +1,4 @@
-"""Packages that only an extra brings: imported when they are needed, named when they are missing."""
+"""Optional packages, which an extra of jaxekf installs: imported when needed."""
 
 from importlib import import_module
 from types import ModuleType
@@ -7,17 +7,26 @@ from jaxekf._support.errors import MissingPackageError
 
 
 def need(module: str, extra: str) -> ModuleType:
-    """The module of that name, imported; `extra` is the extra of jaxekf that installs it.
+    """Import a module of an optional package.
 
-    Raises `MissingPackageError`, which names the command that installs it, where it is not there, and one
-    that says what went wrong where it is there and does not work.
+    Parameters
+    ----------
+    module
+        Name of the module.
+    extra
+        The extra of jaxekf that installs its package.
+
+    Raises
+    ------
+    MissingPackageError
+        The package is not installed, or its import fails.
     """
     command = f'pip install "jaxekf[{extra}]"'
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise MissingPackageError(
-            f"got no package '{error.name or module}', expected it for this; install it: {command}"
+            f"got no package '{error.name or module}', expected it to be installed; install it: {command}"
         ) from error
     except ImportError as error:
         raise MissingPackageError(

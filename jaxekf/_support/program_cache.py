@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk, so that a later process reads them instead of compiling them again."""
+"""A cache of compiled programs on disk, so that a later process does not compile them again."""
 
 import hashlib
 import os
@@ -15,21 +15,32 @@ from jaxekf._support.errors import CacheError
 
 _CPU_INFO = Path("/proc/cpuinfo")
 _DESCRIBING = ("model name", "flags", "Features", "CPU implementer", "CPU part")
-"""Lines of /proc/cpuinfo that say what code a processor can run, on x86 and on ARM."""
+"""Lines of /proc/cpuinfo with the instruction set of a processor, on x86 and on ARM."""
 
 
 def keep_programs(folder: Path | str | None = None) -> Path:
-    """Keep programs that JAX compiles from now on in `folder`, and read those that are kept there.
+    """Keep the programs that JAX compiles from now on in a folder, and use those that are there.
 
-    Call it once, before the first estimate. Without `folder` it is the user's cache folder
-    (`default_folder`), which the command line uses too. Returns the sub-folder that is used: it is named
-    after the version of jaxlib and the processor, since a program compiled for one does not run, or runs
-    slowly, on another. Programs of any size are kept, because even the smallest takes ten times longer to
-    compile than to read. It applies to every program of the process, as does all of JAX's configuration.
-    Nothing is ever removed; the folder can be deleted at any time. Programs that call back into Python
-    are compiled in each process.
+    Call it once, before the first estimate; it applies to the whole process. Programs of any size are kept,
+    because even the smallest takes ten times longer to compile than to read; programs that call back into
+    Python are not. Nothing is ever removed; the folder can be deleted at any time.
 
-    Raises `CacheError` where the folder cannot be written; JAX's settings then stay as they are.
+    Parameters
+    ----------
+    folder
+        Folder of the cache; by default ``jaxekf`` in the user's cache folder (`default_folder`), as in the
+        command line.
+
+    Returns
+    -------
+    Path
+        The sub-folder that is used. Its name has the version of jaxlib and the processor, since a program
+        that was compiled for one does not run, or is slow, on another.
+
+    Raises
+    ------
+    CacheError
+        The folder cannot be written; JAX's settings are then unchanged.
     """
     place = Path(default_folder() if folder is None else folder).expanduser().absolute()
     place = place / f"jaxlib-{version('jaxlib')}-{processor()}"
@@ -40,10 +51,10 @@ def keep_programs(folder: Path | str | None = None) -> Path:
     except OSError as error:
         raise CacheError(
             f"{place}: got '{error.strerror or error}', expected a folder that can be written, to keep"
-            " compiled programs; name another folder"
+            " compiled programs; pass another folder"
         ) from error
     if jax.config.values["jax_compilation_cache_dir"] not in (None, str(place)):
-        # JAX opens its first folder for good.
+        # JAX uses its first folder until the cache is reset.
         compilation_cache.reset_cache()
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -64,7 +75,7 @@ def processor() -> str:
         text = _CPU_INFO.read_text("utf-8", "replace")
     except OSError:
         text = ""
-    # The first core is enough, and the order of its flags means nothing.
+    # The first core is enough, and the order of its flags has no meaning.
     lines = dict(
         re.split(r"\s*:\s*", line, maxsplit=1)
         for line in text.split("\n\n")[0].splitlines()

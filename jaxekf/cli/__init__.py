@@ -1,44 +1,48 @@
-"""The command line: simulate, import, check, allan, align, estimate, tune, plot, report, demo."""
+"""The command line: simulate, import, check, allan, align, estimate, tune, plot, report, demo.
+
+Each command is a module here, imported only when the command runs. A new command is a module with its line
+in `_SUMMARIES`.
+"""
 
 import click
 
 from jaxekf import __version__
-from jaxekf.cli.commands import Commands, Place
+from jaxekf.cli.commands import LazyCommand, LazyGroup
 
 _SUMMARIES = {
     "align": "Clock offset and rotation between tracker and IMU.",
-    "allan": "Noise densities of an IMU from a static log.",
-    "check": "Samples, gaps, clocks, frames and units of runs.",
-    "demo": "Tuning and estimates on the bundled recordings.",
-    "estimate": "Attitude, rate and biases of runs, as result folders.",
-    "import": "Recordings of other programs, written as runs.",
+    "allan": "Noise densities of an IMU from a static recording.",
+    "check": "Check of samples, gaps, clocks, frames and units.",
+    "demo": "Tuning and estimates of the bundled recordings.",
+    "estimate": "Attitude, rate, biases and pose of runs.",
+    "import": "Recordings of other programs, converted to runs.",
     "plot": "Figures of runs.",
-    "report": "Results as one HTML page that needs no network.",
+    "report": "Results as one HTML page that works offline.",
     "simulate": "Simulated runs with their truth.",
-    "tune": "Noise and calibration, tuned on runs by gradient.",
+    "tune": "Noise and calibration, tuned by gradient on runs.",
 }
-# `import` cannot name a module or a function.
-_ELSEWHERE = {"import": ("imports", "import_run")}
+# A Python module or function cannot have the name `import`.
+_OTHER_NAMES = {"import": ("imports", "import_run")}
 
 
-def _place(name: str) -> Place:
-    module, attribute = _ELSEWHERE.get(name, (name, name))
-    return Place(f"jaxekf.cli.{module}", attribute, _SUMMARIES[name])
+def _lazy_command(name: str) -> LazyCommand:
+    module, attribute = _OTHER_NAMES.get(name, (name, name))
+    return LazyCommand(f"jaxekf.cli.{module}", attribute, _SUMMARIES[name])
 
 
 @click.group(
-    cls=Commands,
-    places={name: _place(name) for name in _SUMMARIES},
+    cls=LazyGroup,
+    lazy_commands={name: _lazy_command(name) for name in _SUMMARIES},
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="jaxekf")
 def main() -> None:
     """Attitude, rate, bias and pose from recorded runs of an optical tracker and an IMU.
 
-    A run is a folder with recording.toml, optical.csv or markers.csv, imu.csv and, for truth, encoder.csv;
-    or with camera.csv and landmarks.csv.
+    A run is a folder with recording.toml, imu.csv and optical.csv, markers.csv or camera.csv with
+    landmarks.csv; encoder.csv has the truth, if it is known.
     """
-    # JAX costs most of a second: not for the help and the version, which end before this.
+    # The import of JAX takes most of a second; the help and the version end before it.
     from jaxekf._support.compilation import set_up
     from jaxekf.cli.machine import prepare
 

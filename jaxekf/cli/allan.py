@@ -1,4 +1,4 @@
-"""`jaxekf allan`: noise densities from what rests."""
+"""`jaxekf allan`: sensor noise from a static recording."""
 
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from jaxekf.cli.console import (
     json_option,
     model_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -37,18 +38,19 @@ from jaxekf.reporting.plots.style import save
 @click.command()
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option(
-    "--from", "begin_s", type=click.FloatRange(0.0), help="Seconds: where the stretch begins."
+    "--from",
+    "begin_s",
+    type=click.FloatRange(0.0),
+    help="Start of the static interval, s after the first IMU sample.  [default: the first sample]",
 )
 @click.option(
     "--to",
     "end_s",
     type=click.FloatRange(0.0, min_open=True),
-    help="Seconds from the IMU's first sample.  [default: while the gyroscope stays quiet]",
+    help="End of the static interval, s after the first IMU sample.  [default: the first motion]",
 )
 @model_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("allan"), show_default=True
-)
+@output_option("allan", "Folder for allan.csv, allan.png and noise.toml.")
 @overwrite_option
 @json_option
 def allan(
@@ -60,39 +62,39 @@ def allan(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Noise densities from LOG: a run that rests at its start, or a CSV file like imu.csv.
+    """Estimate sensor noise from LOG: a run that is static at its start, or a CSV file like imu.csv.
 
-    Writes allan.csv and allan.png with the Allan deviation, and noise.toml to tune from: white noise and
-    random walk of the bias of gyroscope and accelerometer, and the tracker's scatter at rest. Where the
-    rest is too short to tell a random walk it says so.
+    The output has the Allan deviation (allan.csv, allan.png), and noise.toml, a start for tuning: white
+    noise and bias random walk of gyroscope and accelerometer, and standard deviations of the tracker. A
+    note names the random walks that the static interval is too short for.
     """
     check_output(output, "allan.csv", overwrite=overwrite)
     chosen = get_model(model)
     recording = read_log(log)
-    found = static_noise(recording, begin_s, end_s)
-    start = start_for(chosen, found)
+    noise = static_noise(recording, begin_s, end_s)
+    start = start_for(chosen, noise)
     note(
-        f"{found.run}: rests from {found.begin_s:.1f} to {found.end_s:.1f} s, {found.imu.samples} samples"
+        f"{noise.run}: static from {noise.begin_s:.1f} to {noise.end_s:.1f} s, {noise.imu.samples} samples"
     )
-    if found.imu.missing:
-        note(f"{found.run}: {found.imu.missing} missing samples were interpolated")
+    if noise.imu.missing:
+        note(f"{noise.run}: {noise.imu.missing} missing samples were interpolated")
     for text in start.sentences:
-        note(f"{found.run}: {text}")
+        note(f"{noise.run}: {text}")
     with whole_folder(output, "allan.csv", overwrite=overwrite) as folder:
-        write_curve(folder / "allan.csv", found)
-        save(draw(found), folder / "allan.png")
-        origin = {"rest": found.run, "seconds": found.imu.duration_s, "found": list(start.taken)}
+        write_curve(folder / "allan.csv", noise)
+        save(draw(noise), folder / "allan.png")
+        origin = {"rest": noise.run, "seconds": noise.imu.duration_s, "found": list(start.taken)}
         origin |= provenance() | {"inputs": inputs_of([recording])}
         parameters.save_noise(folder, chosen, start.params, origin)
     note(f"wrote {output}: noise.toml for {chosen.name} sets {', '.join(start.taken) or 'nothing'}")
     if as_json:
         files = {name: str(output / name) for name in ("allan.csv", "allan.png", "noise.toml")}
-        document = as_dict(found) | {"notes": list(start.sentences), "files": files}
+        document = as_dict(noise) | {"notes": list(start.sentences), "files": files}
         print_json(document | {"model": chosen.name, "set": list(start.taken)})
         return
-    for label, sensor in found.sensors.items():
+    for label, sensor in noise.sensors.items():
         _print_sensor(label, sensor)
-    _print_tracker(found.tracker)
+    _print_tracker(noise.tracker)
 
 
 def _print_sensor(label: str, sensor: SensorNoise) -> None:
@@ -100,15 +102,15 @@ def _print_sensor(label: str, sensor: SensorNoise) -> None:
     white, walk = ("deg/s/√Hz", "deg/s²/√Hz") if turn != 1.0 else ("m/s²/√Hz", "m/s³/√Hz")
     floor, at = sensor.floor()
     rows = []
-    for i, (axis, made) in enumerate(zip(AXES, sensor.axes, strict=True)):
+    for i, (axis, noise) in enumerate(zip(AXES, sensor.axes, strict=True)):
         rows.append(
             [
                 axis,
-                *_with_interval(made.white, turn),
+                *_with_interval(noise.white, turn),
                 f"{turn * floor[i]:.3g}",
                 f"{at[i]:.3g}",
-                f"{turn * made.flicker:.3g}" if made.flicker else "–",
-                *_with_interval(made.walk, turn),
+                f"{turn * noise.flicker:.3g}" if noise.flicker else "–",
+                *_with_interval(noise.walk, turn),
             ]
         )
     unit = white.split("/√")[0]
@@ -116,8 +118,8 @@ def _print_sensor(label: str, sensor: SensorNoise) -> None:
         "axis",
         f"white noise\n({white})",
         "95 %",
-        f"lowest\n({unit})",
-        "at\n(s)",
+        f"minimum\n({unit})",
+        "at τ\n(s)",
         f"flicker\n({unit})",
         f"random walk\n({walk})",
         "95 %",
@@ -126,7 +128,7 @@ def _print_sensor(label: str, sensor: SensorNoise) -> None:
 
 
 def _with_interval(made: Coefficient, turn: float) -> tuple[str, str]:
-    """A coefficient and its interval; where it is not told from nothing, the limit alone."""
+    """A coefficient and its 95 % interval; only the upper bound if it is not significant."""
     low, high = (f"{turn * value:.3g}" for value in (made.low, made.high))
     return (
         (f"{turn * made.value:.3g}", f"{low} to {high}")
@@ -156,5 +158,5 @@ def _print_tracker(noise: TrackerNoise) -> None:
                 for i, axis in enumerate(AXES)
             ]
     if rows:
-        columns = ["of", "axis", "deviation", "95 %", "unit"]
-        print_table("Tracker at rest, sample to sample", columns, rows)
+        columns = ["measurement", "axis", "standard deviation", "95 %", "unit"]
+        print_table("Tracker at rest, from sample to sample", columns, rows)

@@ -1,4 +1,4 @@
-"""The group of commands: each is imported when it runs, and what can go wrong becomes one line."""
+"""The group of commands: a command is imported when it runs, and its errors become messages of one line."""
 
 import errno
 from collections.abc import Mapping
@@ -12,13 +12,13 @@ from click.shell_completion import CompletionItem
 from jaxekf._support.errors import JaxekfError
 
 WRITTEN = "jaxekf.written"
-"""Where a command's context keeps the outputs that are finished."""
+"""Key of the finished outputs in a command's context (`click.Context.meta`)."""
 _SIGINT_STATUS = 130
-"""128 and the number of the signal, as shells have it."""
+"""128 plus the number of the signal, the convention of shells."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-class Place(NamedTuple):
+class LazyCommand(NamedTuple):
     """A command that is not imported yet."""
 
     module: str
@@ -26,31 +26,35 @@ class Place(NamedTuple):
     summary: str
 
 
-class Commands(click.Group):
-    """A group that imports a command only to run it: its own help must not cost JAX and SciPy."""
+class LazyGroup(click.Group):
+    """A group that imports a command only to run it, so that its help does not import JAX and SciPy."""
 
-    def __init__(self, *args: Any, places: Mapping[str, Place], **options: Any) -> None:
+    def __init__(
+        self, *args: Any, lazy_commands: Mapping[str, LazyCommand], **options: Any
+    ) -> None:
         super().__init__(*args, **options)
-        self.places = dict(places)
+        self.lazy_commands = dict(lazy_commands)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(self.places)
+        return sorted(self.lazy_commands)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        place = self.places.get(cmd_name)
-        return place and getattr(import_module(place.module), place.attribute)
+        lazy = self.lazy_commands.get(cmd_name)
+        return lazy and getattr(import_module(lazy.module), lazy.attribute)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, self.places[name].summary) for name in sorted(self.places)])
+            formatter.write_dl(
+                [(name, lazy.summary) for name, lazy in sorted(self.lazy_commands.items())]
+            )
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        found = [
-            CompletionItem(name, help=place.summary)
-            for name, place in sorted(self.places.items())
+        names = [
+            CompletionItem(name, help=lazy.summary)
+            for name, lazy in sorted(self.lazy_commands.items())
             if name.startswith(incomplete)
         ]
-        return found + click.Command.shell_complete(self, ctx, incomplete)
+        return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -58,30 +62,30 @@ class Commands(click.Group):
         except JaxekfError as error:
             raise click.ClickException(str(error)) from error
         except BrokenPipeError:
-            raise  # Whoever read has heard enough: click ends in silence.
+            raise  # The reader of the pipe has closed it: click ends without a message.
         except OSError as error:
-            raise click.ClickException(_of_system(error)) from error
+            raise click.ClickException(_system_message(error)) from error
         except MemoryError as error:
             raise click.ClickException(
-                f"got too little memory ({str(error) or 'out of memory'}), expected enough for all that was"
-                " named; name fewer or shorter runs at once"
+                f"got too little memory ({str(error) or 'out of memory'}), expected enough for all"
+                " runs; pass fewer or shorter runs at once"
             ) from error
         except KeyboardInterrupt:
             click.echo(_interrupted(ctx.meta.get(WRITTEN, [])), err=True)
             raise click.exceptions.Exit(_SIGINT_STATUS) from None
 
 
-def _of_system(error: OSError) -> str:
-    """One sentence on what the system refused."""
-    said = error.strerror or " ".join(str(error).split())
-    place = f"{error.filename or 'output'}: got '{said}', expected"
+def _system_message(error: OSError) -> str:
+    """One sentence on an error of the operating system."""
+    reason = error.strerror or " ".join(str(error).split())
+    place = f"{error.filename or 'output'}: got '{reason}', expected"
     if error.errno in _FULL:
-        return f"{place} room to write; free some or name an output on another disk"
+        return f"{place} free space; free some or name an output on another disk"
     return f"{place} to read or write there; check the path and its permissions"
 
 
 def _interrupted(written: list[Path]) -> str:
-    """What a command that was stopped leaves behind."""
+    """The message of an interrupted command, with the outputs it has finished."""
     if not written:
         return "interrupted: nothing was written"
     more = f" and {len(written) - 3} more" if len(written) > 3 else ""

@@ -1,8 +1,8 @@
-"""Shared parts of the commands: options, tables, progress and JSON."""
+"""Options, tables, progress and JSON that the commands share."""
 
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,47 +20,60 @@ from jaxekf.models import REGISTRY
 from jaxekf.models.robust import MEANS
 
 json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
+    "--json", "as_json", is_flag=True, help="JSON on standard output instead of a table."
 )
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace the output if it exists."
+    "--overwrite", is_flag=True, help="Replacement of an existing output."
 )
 model_option = click.option(
     "--model",
     default="loose",
     show_default=True,
-    help=f"{', '.join(REGISTRY)}, or your own as module:attribute.",
+    help=f"Model: {', '.join(REGISTRY)}, or your own as module:attribute.",
 )
 noise_option = click.option(
     "--noise",
     "noise_files",
     multiple=True,
     type=click.Path(),
-    help="noise.toml, calibration.toml, or a folder that holds them; repeatable.",
+    help="Noise and calibration: noise.toml, calibration.toml, or a folder with them; repeatable."
+    "  [default: as in the model]",
 )
 
 sort_option = click.option(
     "--sort",
     is_flag=True,
-    help="Sort rows that are out of order by time, instead of refusing the file.",
+    help="Sorting of rows by time, instead of an error for rows that are out of order.",
 )
 robust_option = click.option(
     "--robust",
     "means",
     type=click.Choice(MEANS),
-    help="Robust weighting of outliers: gate refuses them, huber and student reduce their weight, none"
-    " uses all samples in full.  [default: that of the model]",
+    help="Treatment of outliers: gate rejects them, huber and student reduce their weight (Huber or"
+    " Student-t), none uses all samples with full weight.  [default: as in the model]",
 )
 
 
+def output_option(default: str, contents: str) -> Callable[[Any], Any]:
+    """The option ``-o``: a path with its default, and the noun phrase of its help."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path),
+        default=Path(default),
+        show_default=True,
+        help=contents,
+    )
+
+
 def wrote(path: Path) -> None:
-    """Report that an output is complete; a command that is stopped repeats it."""
+    """Print that an output is complete, and list it in the message of an interrupted command."""
     click.get_current_context().meta.setdefault(WRITTEN, []).append(path)
     note(f"wrote {path}")
 
 
 def note(text: str) -> None:
-    """A line for the person at the terminal, on standard error."""
+    """Print a line for the user on standard error."""
     click.echo(text, err=True)
 
 
@@ -72,7 +85,7 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """A table on standard output; numbers to the right, unknown ones as a dash."""
+    """Print a table on standard output; numbers are right-aligned, NaN is a dash."""
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for i, column in enumerate(columns):
         numeric = bool(rows) and isinstance(rows[0][i], float | int)
@@ -90,7 +103,7 @@ def _cell(value: Any) -> str:
 
 
 class TuningBar:
-    """Progress callback of a tuner; `stage` sets the description of its steps."""
+    """A progress callback of the tuner; `stage` names the part of the tuning that follows."""
 
     def __init__(self, bar: Progress, iterations: int) -> None:
         self.bar, self.iterations, self.prefix = bar, iterations, "tuning"
@@ -98,19 +111,19 @@ class TuningBar:
 
     def __call__(self, step: Any, total: int) -> None:
         held = "" if step.validation != step.validation else f", validation {step.validation:.5g}"
-        value = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
-        text = f"{self.prefix}: {value}"
+        result = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
+        text = f"{self.prefix}: {result}"
         self.bar.update(self.task, completed=step.number + 1, total=total, description=text)
 
     def stage(self, text: str) -> None:
-        """Restart the bar with another description, such as ``fold 2/5``."""
+        """Reset the bar with another description, such as ``fold 2/5``."""
         self.prefix = text
         self.bar.reset(self.task, total=self.iterations, description=text)
 
 
 @contextmanager
 def tuning_progress(iterations: int) -> Iterator[TuningBar]:
-    """A progress bar for the tuner on a terminal's standard error; silent in a pipe."""
+    """A progress bar for the tuner on standard error, if that is a terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

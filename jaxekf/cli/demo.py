@@ -10,7 +10,7 @@ import numpy as np
 
 import tuning
 from jaxekf.cli.comparison import print_comparison
-from jaxekf.cli.console import json_option, note, print_json, tuning_progress
+from jaxekf.cli.console import json_option, note, output_option, print_json, tuning_progress
 from jaxekf.estimation.batch import estimate_many, provenance
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.estimation.result import Estimate
@@ -28,29 +28,29 @@ from jaxekf.simulation import demo as runs
 from tuning.comparison.compare import compare_estimates
 from tuning.results.comparison import as_dicts
 
-# Values as from data sheets: a gyroscope's best case, a tracker's worst.
+# Values from data sheets: the best case of the gyroscope, the worst case of the tracker.
 _HAND_SET_DEG = {"gyroscope": 0.01, "bias_walk": 0.001, "optical": 1.0}
 _ITERATIONS = 20
 
 
-def _ahead(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
-    """The runs that are held out and their estimates before tuning; imports what figures need."""
+def _prepare_test(hand_set: Parameters) -> tuple[list[Recording], list[Estimate]]:
+    """The test runs and their estimates before tuning; also imports the libraries of the figures."""
     testing = [load(path) for path in runs.paths(runs.TESTING)]
-    made = estimate_many(testing, "loose", hand_set)
+    estimates = estimate_many(testing, "loose", hand_set)
     import_module("jaxekf.cli.plot")
     import_module("scipy.stats")
-    return testing, made
+    return testing, estimates
 
 
 @click.command()
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("demo"), show_default=True
+@output_option(
+    "demo", "Folder for noise, estimates and figures; one of an earlier call is replaced."
 )
 @json_option
 def demo(output: Path, as_json: bool) -> None:
     """Tune on some bundled runs, estimate the others, and write tables, estimates and figures.
 
-    The recordings come from the package's own simulator. A demo folder of an earlier call is replaced.
+    The recordings are simulated. A demo folder of an earlier call is replaced.
     """
     check_output(output, "demo.json", overwrite=True)
     began = time.perf_counter()
@@ -62,9 +62,9 @@ def demo(output: Path, as_json: bool) -> None:
         [load(path) for path in runs.paths(names)] for names in (runs.TRAINING, runs.VALIDATION)
     )
     note(f"tuning on {', '.join(runs.TRAINING)}; validating on {', '.join(runs.VALIDATION)}")
-    with ThreadPoolExecutor(1) as beside:
-        # Much of the tuning is the compiler's time, in which another core is free.
-        ahead = beside.submit(_ahead, hand_set)
+    with ThreadPoolExecutor(1) as background:
+        # Much of the tuning is compilation on one core; another core is free.
+        prepared = background.submit(_prepare_test, hand_set)
         with tuning_progress(_ITERATIONS) as progress:
             tuned = tuning.tune(
                 training,
@@ -74,14 +74,14 @@ def demo(output: Path, as_json: bool) -> None:
                 iterations=_ITERATIONS,
                 progress=progress,
             )
-        testing, by_hand = ahead.result()
+        testing, before = prepared.result()
     note(f"estimating {', '.join(runs.TESTING)}")
-    estimates = {"hand-set": by_hand, "tuned": estimate_many(testing, model, tuned.params)}
+    estimates = {"hand-set": before, "tuned": estimate_many(testing, model, tuned.params)}
     compared = compare_estimates(testing, estimates)
     every = [*training, *validation, *testing]
-    # Figures and their libraries are imported by `_ahead`, while the compiler works.
+    # `_prepare_test` has imported the figures and their libraries, during the compilation.
     from jaxekf.cli.plot import draw
-    from jaxekf.reporting.plots import possible_figures
+    from jaxekf.reporting.plots import available_figures
 
     figures = []
     with whole_folder(output, "demo.json", overwrite=True) as folder:
@@ -92,7 +92,7 @@ def demo(output: Path, as_json: bool) -> None:
             made.save(folder / "result" / recording.name, diagnosis=found, score=judged)
             chosen = ("attitude", "occlusion")
             if recording.name == "constant-rate":
-                chosen = possible_figures(made, recording)
+                chosen = available_figures(made, recording)
             files = draw(made, recording, folder / "figures", chosen)
             figures += [str(output / "figures" / file.name) for file in files]
         document = {
@@ -108,12 +108,12 @@ def demo(output: Path, as_json: bool) -> None:
             "figures": figures,
         }
         (folder / "demo.json").write_text(codec.as_text(document), "utf-8")
-    # Not in the file, which is the same for the same runs.
+    # Not in the file, so that the same runs give the same file.
     document["seconds"] = round(time.perf_counter() - began, 1)
     if as_json:
         print_json(document)
         return
-    print_comparison("Runs the tuner has not seen", compared.rows)
+    print_comparison("Test runs, not used for tuning", compared.rows)
     for name, value in document["noise_deg"].items():
         unit = model.units.noise._asdict()[name].replace("rad", "deg", 1)
         click.echo(f"  {name:<10} {_HAND_SET_DEG[name]:>7} -> {value:.4f} {unit}")

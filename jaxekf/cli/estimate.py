@@ -1,4 +1,4 @@
-"""`jaxekf estimate`: attitude, rate and bias of recorded runs."""
+"""`jaxekf estimate`: attitude, rate, biases and pose of recorded runs."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +14,7 @@ from jaxekf.cli.console import (
     model_option,
     noise_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -24,7 +25,7 @@ from jaxekf.cli.console import (
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import estimate_many
 from jaxekf.estimation.causal import estimate_online
-from jaxekf.estimation.output_times import Every, Requested, every, read_requested
+from jaxekf.estimation.output_times import Every, OutputTimes, every, read_output_times
 from jaxekf.estimation.result import Estimate, trackers
 from jaxekf.evaluation import metrics
 from jaxekf.evaluation.diagnosis import Diagnosis, diagnose, diagnose_many
@@ -42,9 +43,21 @@ from jaxekf.recordings.types import Recording
 def load_runs(
     paths: Sequence[Path], *, sort: bool = False, model: Model | None = None
 ) -> list[Recording]:
-    """Read runs; each must have a name of its own, since results are named after them.
+    """Read runs and print notes on masked and dropped rows.
 
-    What was masked or dropped is said. For a `model` that an IMU drives a run is cut at the IMU's gaps.
+    Parameters
+    ----------
+    paths
+        Run folders or files. Their names must differ, since results have the names of the runs.
+    sort
+        Sort rows by time instead of raising for rows that are out of order.
+    model
+        The model that the runs are for. If an IMU is its input, a run is cut at the gaps of the IMU.
+
+    Raises
+    ------
+    RecordingError
+        A run cannot be read, or two runs have the same name.
     """
     recordings = []
     for path in paths:
@@ -66,18 +79,18 @@ def load_runs(
 
 
 def _parts(recording: Recording) -> list[Recording]:
-    """The parts of a run that can be estimated; what is left out is said, with its rows."""
+    """The parts of a run between gaps of the IMU; notes name the parts that cannot be estimated."""
     good, bad = split_at_gaps(recording)
     for part in bad:
         rows = ", ".join(f"{account.rows} of {label}" for label, account in part.intake.items())
         note(
-            f"{recording.name}: {part.name} is left out, too short or without a sample of the tracker"
+            f"{recording.name}: {part.name} is left out: too short, or without a sample of the tracker"
             f" ({rows or 'no rows'})"
         )
     if len(good) + len(bad) > 1:
         note(
-            f"{recording.name}: the IMU has gaps, over which nothing is made up:"
-            f" {len(good)} of {len(good) + len(bad)} parts are estimated, each for itself"
+            f"{recording.name}: the IMU has gaps, over which it is not extrapolated:"
+            f" {len(good)} of {len(good) + len(bad)} parts are estimated separately"
         )
     if not good:
         raise RecordingError(
@@ -105,7 +118,7 @@ def describe(
 
 
 def warn(made: Estimate, diagnosis: Diagnosis) -> None:
-    """Print notes that are not in the table: dropped rows and the diagnosis."""
+    """Print notes on dropped rows, on the start and on the consistency of an estimate."""
     for name, count in made.account.items():
         if count.get("dropped_outside_run"):
             note(
@@ -122,26 +135,24 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 @robust_option
 @noise_option
 @sort_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("result"), show_default=True
-)
+@output_option("result", "Folder for the result folders, one for each run.")
 @click.option(
     "--online",
     is_flag=True,
-    help="Causal estimate at each sample of the IMU from the measurements that had arrived by then, with"
-    " the tracker's latency as in a live system; for models that an IMU drives.",
+    help="Causal estimates at each IMU sample, from measurements that had arrived after the tracker's"
+    " latency, as in a live system; for models with an input.",
 )
 @click.option(
     "--smooth",
     is_flag=True,
-    help="Run the smoother: each instant uses the measurements of the whole run.",
+    help="Smoothed estimates: each instant from the whole run.",
 )
 @click.option(
     "--export",
     "exports",
     multiple=True,
     type=click.Choice(tuple(FILES)),
-    help="Further file in each result folder: the whole estimate as estimate.npz or estimate.h5, the"
+    help="Additional file in each result folder: the complete estimate as estimate.npz or estimate.h5, the"
     " trajectory as trajectory.tum; repeatable.",
 )
 @click.option(
@@ -149,15 +160,16 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     "times_files",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="CSV file of further output times, in its column time, in seconds on the recording's clock:"
-    " writes requested.csv, and exports hold these times only. One for all runs, or repeated for each.",
+    help="CSV file with additional output times in the column time, s on the recording's clock. The"
+    " estimates at these times are in requested.csv and in the exports. One file for all runs, or repeated"
+    " for each.",
 )
 @click.option(
     "--every",
-    "distance",
+    "period",
     type=click.FloatRange(min=1e-9, max=1e9),
     metavar="SECONDS",
-    help="Further output times as with --at, on a regular grid from the first instant of each run.",
+    help="Period of additional output times, s, from the first instant of each run on; see --at.",
 )
 @overwrite_option
 @json_option
@@ -172,38 +184,38 @@ def estimate(
     smooth: bool,
     exports: tuple[str, ...],
     times_files: tuple[Path, ...],
-    distance: float | None,
+    period: float | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Estimate RUNS and write a result folder for each under the output."""
+    """Estimate attitude, rate, biases and pose of RUNS, and write a result folder for each."""
     if online and smooth:
         raise click.UsageError(
-            "got --online and --smooth, expected one of them: a causal estimate does not use the whole"
-            " run; leave one out"
+            "got --online and --smooth, expected one of them: a causal estimate does not use the whole run;"
+            " leave one out"
         )
-    requested = _requested(times_files, distance, len(runs))
+    requested = _requested(times_files, period, len(runs))
     if online and requested is not None:
         raise click.UsageError(
-            "got --online and times to estimate at, expected one of them: a causal estimate is made at"
-            " the samples of the IMU; leave one out, or feed a jaxekf.Stream"
+            "got --online and times to estimate at, expected one of them: causal estimates are at the"
+            " samples of the IMU; leave one out, or use a jaxekf.Stream"
         )
     chosen = get_model(model) if means is None else robust(model, means)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs, sort=sort, model=chosen)
     if isinstance(requested, list):
-        requested = [_inside(requested[runs.index(r.path or r.name)], r) for r in recordings]
+        requested = [_within_part(requested[runs.index(r.path or r.name)], r) for r in recordings]
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
     if online:
-        made_of = (estimate_online(recording, chosen, params) for recording in recordings)
+        pending = (estimate_online(recording, chosen, params) for recording in recordings)
     else:
-        made_of = iter(estimate_many(recordings, chosen, params, smooth=smooth, at=requested))
+        pending = iter(estimate_many(recordings, chosen, params, smooth=smooth, at=requested))
     estimates, summaries = [], []
-    # One after the other as far as can be: what is finished is on the disk should the next one be stopped.
+    # Each result is written before the next estimate, so that it is kept if the command is interrupted.
     for recording in recordings:
         with memory.for_runs([recording.name]):
-            made = next(made_of)
+            made = next(pending)
             diagnosis = diagnose(made, recording)
             truth = recording.encoder is not None
             score = metrics.score(made, recording).as_dict() if truth else None
@@ -227,17 +239,17 @@ def estimate(
     if as_json:
         print_json(document)
         return
-    known = ", as known at each time" if online else ", smoothed" if smooth else ""
-    _print_estimates(f"Estimates by {chosen.name}{known}", summaries)
+    kind = ", causal" if online else ", smoothed" if smooth else ""
+    _print_estimates(f"Estimates by {chosen.name}{kind}", summaries)
 
 
 def _requested(
-    files: tuple[Path, ...], distance: float | None, runs: int
-) -> list[Requested] | Every | None:
-    """Output times requested by one of two options, for each run or all."""
-    if files and distance is not None:
+    files: tuple[Path, ...], period: float | None, runs: int
+) -> list[OutputTimes] | Every | None:
+    """The output times of --at or --every: for each run, or one grid for all."""
+    if files and period is not None:
         raise click.UsageError(
-            "got --at and --every, expected one of them, since each says which times; leave one out"
+            "got --at and --every, expected one of them, since each gives the times; leave one out"
         )
     if len(files) not in (0, 1, runs):
         raise click.UsageError(
@@ -245,33 +257,35 @@ def _requested(
             " the files in the order of the runs"
         )
     if files:
-        times: list[Requested] = [read_requested(file) for file in files]
+        times: list[OutputTimes] = [read_output_times(file) for file in files]
         return times * runs if len(times) == 1 else times
     try:
-        return None if distance is None else every(distance)
+        return None if period is None else every(period)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
 
 
-def _inside(asked: Requested | Every | None, recording: Recording) -> Any:
-    """Requested times of a run that are in one of its parts; None for none."""
-    if "part" not in recording.info or not isinstance(asked, np.ndarray):
-        return asked
+def _within_part(requested: OutputTimes | Every | None, recording: Recording) -> Any:
+    """The output times of a run that are within one of its parts; None if there are none."""
+    if "part" not in recording.info or not isinstance(requested, np.ndarray):
+        return requested
     time = recording.need_imu().time_ns
-    chosen = asked[(asked >= time[0]) & (asked <= time[-1])]
+    chosen = requested[(requested >= time[0]) & (requested <= time[-1])]
     return chosen if chosen.size else None
 
 
 def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
-    """Print one row for each run, with columns of position if any run has a score of it."""
+    """One row for each run; columns of position only if the true position of some run is known."""
     columns = ["run", "seconds"]
     scores = {
         "attitude_rmse_deg": "attitude RMSE\n(deg)",
         "rate_rmse_deg_s": "rate RMSE\n(deg/s)",
         "attitude_nees": "NEES",
     }
-    placed = [summary["score"]["position_rmse_mm"] for summary in summaries if "score" in summary]
-    if any(value == value for value in placed):
+    position_rmse = [
+        summary["score"]["position_rmse_mm"] for summary in summaries if "score" in summary
+    ]
+    if any(value == value for value in position_rmse):
         scores |= {
             "position_rmse_mm": "position RMSE\n(mm)",
             "position_nees": "position\nNEES",
@@ -281,15 +295,15 @@ def _print_estimates(title: str, summaries: list[dict[str, Any]]) -> None:
 
 
 def _row(summary: dict[str, Any], scores: tuple[str, ...]) -> list[Any]:
-    judged = summary.get("score", {})
+    score = summary.get("score", {})
     nan = float("nan")
-    seeing = trackers(summary["account"])
-    used, read = (sum(summary["account"][n].get(k, 0) for n in seeing) for k in ("used", "read"))
-    known = [v for v in (summary["mean_nis"].get(n) for n in seeing) if v is not None]
+    names = trackers(summary["account"])
+    used, read = (sum(summary["account"][n].get(k, 0) for n in names) for k in ("used", "read"))
+    nis = [v for v in (summary["mean_nis"].get(n) for n in names) if v is not None]
     return [
         summary["run"],
         summary["duration_s"],
-        *(judged.get(name, nan) for name in scores),
-        sum(known) / len(known) if known else nan,
+        *(score.get(name, nan) for name in scores),
+        sum(nis) / len(nis) if nis else nan,
         f"{used} of {read}",
     ]

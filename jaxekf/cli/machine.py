@@ -1,4 +1,4 @@
-"""How the commands use the machine: all cores, and compiled programs kept from one call to the next."""
+"""Settings of JAX for the commands: all CPU cores, and a cache of compiled programs on disk."""
 
 import os
 from contextlib import suppress
@@ -11,10 +11,10 @@ from jaxekf._support.program_cache import keep_programs
 
 
 def prepare() -> None:
-    """Make every core a device, and keep compiled programs in the user's cache folder.
+    """Make each CPU core a JAX device, and keep compiled programs in the user's cache folder.
 
-    ``JAXEKF_CACHE`` names another folder; empty, it keeps nothing. Where JAX is in use already its
-    devices stay as they are.
+    The environment variable ``JAXEKF_CACHE`` names another folder; if it is empty, nothing is kept. If JAX
+    is in use already, its devices stay as they are.
     """
     with suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
@@ -24,6 +24,6 @@ def prepare() -> None:
     try:
         keep_programs(chosen)
     except CacheError as error:
-        # A command works without; only who named a folder expects that it is used.
+        # A command works without a cache; only a user who named a folder needs to know.
         if chosen is not None:
             click.echo(f"compiled programs are not kept: {error}", err=True)

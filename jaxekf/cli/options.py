@@ -1,4 +1,4 @@
-"""Kinds of values that the simulator's options take, checked when they are read."""
+"""Types of the values of the simulator's options, with their checks."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,7 @@ import click
 
 
 class Finite(click.FloatRange):
-    """A number within bounds; NaN, which is within any, is refused."""
+    """A number within bounds. NaN, which passes the check of bounds, is an error."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         number = super().convert(value, param, ctx)
@@ -16,30 +16,30 @@ class Finite(click.FloatRange):
 
 
 class Span(NamedTuple):
-    """A stretch of time that markers are hidden in."""
+    """An interval of time in which markers are hidden."""
 
     begin_s: float
     end_s: float
     markers: tuple[str, ...] = ()
-    """Names; empty for all."""
+    """Names of the hidden markers; empty for all."""
 
 
 def spans(
     _: click.Context, __: click.Parameter, values: tuple[str, ...]
 ) -> list[tuple[float, float]]:
-    """``START,END`` in seconds, each as two numbers."""
+    """Parse ``START,END`` in seconds."""
     return [_span(value, value.split(","), "START,END", "20,20.5")[:2] for value in values]
 
 
 def hidden(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> list[Span]:
-    """``START,END[,MARKER...]``: seconds, and the names of the markers that are hidden."""
+    """Parse ``START,END[,MARKER...]``: seconds, and the names of the hidden markers."""
     form, example = "START,END[,MARKER...]", "2,2.5,1,3"
-    found = []
+    parsed = []
     for value in values:
         parts = value.split(",")
         span = _span(value, parts[:2], form, example)
-        found.append(span._replace(markers=tuple(part.strip() for part in parts[2:])))
-    return found
+        parsed.append(span._replace(markers=tuple(part.strip() for part in parts[2:])))
+    return parsed
 
 
 def _span(value: str, parts: list[str], form: str, example: str) -> Span:

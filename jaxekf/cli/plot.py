@@ -10,6 +10,7 @@ from jaxekf.cli.console import (
     model_option,
     noise_option,
     note,
+    output_option,
     print_json,
     robust_option,
     sort_option,
@@ -27,19 +28,21 @@ from jaxekf.reporting import plots
 FIGURES = tuple(plots.figure_functions())
 
 
-def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]) -> list[Path]:
-    """Write the named figures of one run."""
+def draw(
+    estimate: Estimate, recording: Recording, folder: Path, names: tuple[str, ...]
+) -> list[Path]:
+    """Write the named figures of one run into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     functions = plots.figure_functions()
-    possible = plots.possible_figures(made, recording)
-    missing = [name for name in names if name not in possible]
+    available = plots.available_figures(estimate, recording)
+    missing = [name for name in names if name not in available]
     if missing:
         raise ModelError(
-            f"run '{made.run}': got the figures {missing}, expected some of {list(possible)} for this"
+            f"run '{estimate.run}': got the figures {missing}, expected some of {list(available)} for this"
             " model and recording; leave the others out"
         )
     return [
-        plots.save(functions[name](made, recording), folder / f"{made.run}_{name}.png")
+        plots.save(functions[name](estimate, recording), folder / f"{estimate.run}_{name}.png")
         for name in names
     ]
 
@@ -51,15 +54,13 @@ def draw(made: Estimate, recording: Recording, folder: Path, names: tuple[str, .
     "figures",
     multiple=True,
     type=click.Choice(FIGURES),
-    help="Which; repeatable.  [default: all]",
+    help="Figure to draw; repeatable.  [default: all that model and recording have data for]",
 )
 @model_option
 @robust_option
 @noise_option
 @sort_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("figures"), show_default=True
-)
+@output_option("figures", "Folder for the PNG files RUN_FIGURE.png.")
 @json_option
 def plot(
     runs: tuple[Path, ...],
@@ -71,21 +72,21 @@ def plot(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Estimate RUNS and draw what model and recording can show.
+    """Estimate RUNS and draw figures of the estimates.
 
-    attitude, position, velocity, rate: values, and errors where there is an encoder; bias; occlusion: the
-    longest time without a pose; path in three dimensions; of single markers visibility (used, refused,
-    hidden) and innovations.
+    attitude, position, velocity, rate: values, and errors if there is an encoder. bias: gyroscope and
+    accelerometer. occlusion: the longest time without a pose. path: in three dimensions. visibility and
+    innovations: of single markers.
     """
     chosen = get_model(model) if means is None else robust(model, means)
     recordings = load_runs(runs, sort=sort, model=chosen)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []
-    for made, recording in zip(estimates, recordings, strict=True):
-        names = figures or plots.possible_figures(made, recording)
+    for estimate, recording in zip(estimates, recordings, strict=True):
+        names = figures or plots.available_figures(estimate, recording)
         if not names:
-            note(f"{made.run}: no figure: it needs ten instants or more")
-        drawn = draw(made, recording, output, names)
+            note(f"{estimate.run}: no figure, since it has fewer than ten instants")
+        drawn = draw(estimate, recording, output, names)
         files += drawn
         for file in drawn:
             wrote(file)

@@ -1,4 +1,4 @@
-"""`jaxekf simulate`: recorded runs with known truth."""
+"""`jaxekf simulate`: simulated runs with known truth."""
 
 from pathlib import Path
 from typing import Any
@@ -6,120 +6,132 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from jaxekf.cli.console import json_option, overwrite_option, print_json, wrote
+from jaxekf.cli.console import json_option, output_option, overwrite_option, print_json, wrote
 from jaxekf.cli.options import Finite, Span, hidden, spans
 from jaxekf.io import atomic, run_folder
 from jaxekf.recordings.types import Recording
 from jaxekf.simulation import attitude_runs as simulator
 from jaxekf.simulation import marker_runs
 
-# Options that one kind of motion has no use for: to take them in silence would simulate something else
-# than was asked.
+# Options that apply to one kind of motion only; for another kind they are an error.
 _ROTATION_ONLY = ("rate", "speed", "rest", "occlusion", "dropouts", "optical_noise")
 _TOOL_ONLY = ("hide", "latency", "marker_noise", "accelerometer_noise", "accelerometer_bias")
 
 
 @click.command()
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("runs"), show_default=True
-)
+@output_option("runs", "Folder for the run folders MOTION-SEED.")
 @click.option(
     "--motion",
     type=click.Choice(["free", "constant-rate", "tool"]),
     default="free",
     show_default=True,
-    help="free: smooth rotations about all axes; constant-rate: the paper's turn about x; tool: a hand's"
-    " motion in six degrees of freedom, seen as single markers.",
+    help="Motion. free: smooth rotation about all axes; constant-rate: rotation about x at a constant rate;"
+    " tool: hand motion in six degrees of freedom, measured as single markers.",
 )
-@click.option("--runs", type=click.IntRange(1), default=1, show_default=True)
+@click.option(
+    "--runs", type=click.IntRange(1), default=1, show_default=True, help="Number of runs."
+)
 @click.option(
     "--seed",
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Of the first run; the next have the next.",
+    help="Random seed of the first run; it increases by one from run to run.",
 )
-@click.option("--duration", type=Finite(0.5, 1e5), default=60.0, show_default=True, help="Seconds.")
 @click.option(
-    "--rate", type=Finite(-1e4, 1e4), default=-9.0, show_default=True, help="Constant rate, deg/s."
+    "--duration", type=Finite(0.5, 1e5), default=60.0, show_default=True, help="Duration, s."
+)
+@click.option(
+    "--rate",
+    type=Finite(-1e4, 1e4),
+    default=-9.0,
+    show_default=True,
+    help="Rate of the constant-rate motion, deg/s.",
 )
 @click.option(
     "--speed",
     type=Finite(-1e4, 1e4),
     default=40.0,
     show_default=True,
-    help="Free motion, deg/s rms per axis.",
+    help="Rate of the free motion, deg/s RMS per axis.",
 )
 @click.option(
-    "--rest", type=Finite(0.0), default=5.0, show_default=True, help="Seconds at rest at the start."
+    "--rest", type=Finite(0.0), default=5.0, show_default=True, help="Rest at the start, s."
 )
 @click.option(
-    "--occlusion", multiple=True, callback=spans, help="START,END in seconds; repeatable."
+    "--occlusion",
+    multiple=True,
+    callback=spans,
+    help="Interval START,END without tracker samples, s; repeatable.",
 )
 @click.option(
     "--dropouts",
     type=Finite(0.0, 1.0),
     default=0.0,
     show_default=True,
-    help="Share of tracker samples lost.",
+    help="Fraction of tracker samples lost at random.",
 )
 @click.option(
-    "--optical-noise", type=Finite(0.0, 1e3), default=0.3, show_default=True, help="deg per axis."
+    "--optical-noise",
+    type=Finite(0.0, 1e3),
+    default=0.3,
+    show_default=True,
+    help="Standard deviation of the tracker's attitude, deg per axis.",
 )
 @click.option(
     "--gyroscope-noise",
     type=Finite(0.0, 1e3),
     default=0.05,
     show_default=True,
-    help="deg/s/sqrt(Hz).",
+    help="White noise density of the gyroscope, deg/s/sqrt(Hz).",
 )
 @click.option(
     "--bias",
     type=Finite(0.0, 1e3),
     default=0.5,
     show_default=True,
-    help="Of the gyroscope, deg/s, standard deviation at the start.",
+    help="Standard deviation of the initial gyroscope bias, deg/s.",
 )
 @click.option(
     "--bias-walk",
     type=Finite(0.0, 1e3),
     default=None,
-    help="Of the gyroscope, deg/s^2/sqrt(Hz).  [default: 0.005; tool 0.002]",
+    help="Random walk of the gyroscope bias, deg/s^2/sqrt(Hz).  [default: 0.005; tool: 0.002]",
 )
 @click.option(
     "--hide",
     multiple=True,
     callback=hidden,
-    help="Tool: START,END[,MARKER...]: seconds, and which of the markers 1, 2, 3 are hidden (all where"
-    " none is named); repeatable.",
+    help="Interval START,END[,MARKER...] in which the named markers out of 1, 2, 3, or all, are hidden, s"
+    " (tool); repeatable.",
 )
 @click.option(
     "--latency",
     type=Finite(0.0, 10.0),
     default=0.034,
     show_default=True,
-    help="Tool: seconds from when a frame is taken to its stamp.",
+    help="Latency of the tracker's time stamps, s (tool).",
 )
 @click.option(
     "--marker-noise",
     type=Finite(0.0, 1e3),
     default=0.231,
     show_default=True,
-    help="Tool: mm per axis.",
+    help="Standard deviation of a marker position, mm per axis (tool).",
 )
 @click.option(
     "--accelerometer-noise",
     type=Finite(0.0, 1e6),
     default=1.85,
     show_default=True,
-    help="Tool: mg/sqrt(Hz).",
+    help="White noise density of the accelerometer, mg/sqrt(Hz) (tool).",
 )
 @click.option(
     "--accelerometer-bias",
     type=Finite(0.0, 1e3),
     default=0.1,
     show_default=True,
-    help="Tool: m/s^2, standard deviation at the start.",
+    help="Standard deviation of the initial accelerometer bias, m/s^2 (tool).",
 )
 @overwrite_option
 @json_option
@@ -134,14 +146,14 @@ def simulate(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Simulate runs with their truth. Every seed is explicit.
+    """Simulate runs with their truth.
 
-    The motions free and constant-rate have a 62.5 Hz tracker of the attitude, a 125 Hz gyroscope and an
-    encoder: for `jaxekf estimate RUN`. A tool has three markers on an L with legs of 10 cm, seen every 18
-    ms and stamped late, a 500 Hz gyroscope and accelerometer in its corner, and the true pose: for
-    `jaxekf estimate RUN --model tight`.
+    The motions free and constant-rate have a 62.5 Hz attitude tracker, a 125 Hz gyroscope and an encoder;
+    estimate them with `jaxekf estimate RUN`. The motion tool has three markers on an L with legs of 10 cm,
+    one frame every 18 ms with late time stamps, a 500 Hz gyroscope and accelerometer in the corner, and the
+    true pose; estimate it with `jaxekf estimate RUN --model tight`.
     """
-    _refuse_what_does_not_apply(ctx, motion)
+    _check_options(ctx, motion)
     for number in range(seed, seed + runs):
         atomic.check_output(output / f"{motion}-{number}", "recording.toml", overwrite=overwrite)
     written = []
@@ -155,8 +167,8 @@ def simulate(
         print_json({"runs": written})
 
 
-def _refuse_what_does_not_apply(ctx: click.Context, motion: str) -> None:
-    """An option that this motion has no use for is a mistake, not to be passed over."""
+def _check_options(ctx: click.Context, motion: str) -> None:
+    """Raise `click.UsageError` for an option that does not apply to this motion."""
     for name in _ROTATION_ONLY if motion == "tool" else _TOOL_ONLY:
         if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             other = "another motion" if motion == "tool" else "--motion tool"
@@ -168,7 +180,7 @@ def _refuse_what_does_not_apply(ctx: click.Context, motion: str) -> None:
 
 
 def _rotation(motion: str, seed: int, options: dict[str, Any]) -> Recording:
-    """A run of the tracker's attitude and a gyroscope."""
+    """Simulate an attitude tracker and a gyroscope."""
     walk = options["bias_walk"]
     grade = simulator.SensorGrade(
         gyroscope_deg=options["gyroscope_noise"],
@@ -193,12 +205,12 @@ def _rotation(motion: str, seed: int, options: dict[str, Any]) -> Recording:
 
 
 def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
-    """A run of single markers, gyroscope and accelerometer."""
-    walk, given = options["bias_walk"], marker_runs.ToolGrade()
+    """Simulate single markers, gyroscope and accelerometer."""
+    walk, default = options["bias_walk"], marker_runs.ToolGrade()
     grade = marker_runs.ToolGrade(
         gyroscope_deg=options["gyroscope_noise"],
         accelerometer_mg=options["accelerometer_noise"],
-        bias_walk_deg=given.bias_walk_deg if walk is None else walk,
+        bias_walk_deg=default.bias_walk_deg if walk is None else walk,
         bias_deg=options["bias"],
         accelerometer_bias=options["accelerometer_bias"],
         marker_mm=options["marker_noise"],
@@ -216,15 +228,15 @@ def _tool(motion: str, seed: int, options: dict[str, Any]) -> Recording:
     )
 
 
-def _hidden(asked: list[Span], names: tuple[str, ...]) -> marker_runs.Hidden:
-    """Marker by marker; a span that names none hides all."""
-    found = []
-    for span in asked:
+def _hidden(spans: list[Span], names: tuple[str, ...]) -> marker_runs.Hidden:
+    """Hidden intervals of each marker; a span without names is for all markers."""
+    intervals = []
+    for span in spans:
         for name in span.markers or names:
             if name not in names:
                 raise click.UsageError(
                     f"got the marker '{name}' in --hide, expected one of {', '.join(names)};"
                     " check its name"
                 )
-            found.append((name, span.begin_s, span.end_s))
-    return found
+            intervals.append((name, span.begin_s, span.end_s))
+    return intervals

@@ -1,7 +1,7 @@
 """From a recording to an estimate: timeline, padding, batches of runs, causal and live estimates, results.
 
-`batch` estimates whole runs, `causal` says what was known at each time, `live` takes samples as they come.
-What is written to a result folder is in `result`.
+`batch` estimates whole runs, `causal` estimates with measurements that arrive late, `live` takes samples
+as they arrive. `result` holds the estimate and writes the result folder.
 """
 
 from jaxekf._support.lazy import attributes

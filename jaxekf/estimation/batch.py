@@ -1,4 +1,4 @@
-"""From recorded runs to estimates: the host's side of the filter."""
+"""Estimates of whole recorded runs, filtered or smoothed."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,7 +15,7 @@ from jaxekf._support import memory
 from jaxekf._support.compilation import jit
 from jaxekf._support.errors import FilterError, PrecisionError
 from jaxekf.estimation import padding, parameters, timeline
-from jaxekf.estimation.output_times import Every, Requested
+from jaxekf.estimation.output_times import Every, OutputTimes
 from jaxekf.estimation.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.estimation.timeline import Timeline
 from jaxekf.filtering import ekf, smoother
@@ -30,12 +30,12 @@ from jaxekf.recordings.types import NANOSECONDS, Recording
 
 Run = Recording | Path | str
 _BATCH_BYTES = 1 << 30
-_MANY_REFUSED = 0.2
-"""A gate that refuses a larger share of a sensor's samples is worth a word."""
+_HIGH_REJECTION = 0.2
+"""Fraction of a sensor's samples; a note warns if the gate rejects more."""
 
 
 def require_float64() -> None:
-    """Raise `PrecisionError` where JAX is not set to float64."""
+    """Raise `PrecisionError` if JAX is not set to float64."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise PrecisionError(
             "got JAX in float32, expected float64; call jaxekf.set_up() before the first array, or set"
@@ -49,20 +49,44 @@ def estimate(
     params: Parameters | None = None,
     *,
     smooth: bool = False,
-    at: Requested | None = None,
+    at: OutputTimes | None = None,
 ) -> Estimate:
-    """Estimate one run: a `Recording` or the path of a recorded folder.
+    """Estimate one run with the extended Kalman filter or, with `smooth`, the smoother.
 
-    `model` is a name, ``module:attribute`` or a `Model`; `params` are the model's defaults unless
-    given (see `jaxekf.load_parameters`). Each instant is estimated from what was measured until then
-    or, with `smooth`, from the whole run; innovations are those of the filter in both cases.
+    Parameters
+    ----------
+    run
+        A `Recording`, or the path of a run folder.
+    model
+        Name of a model, ``module:attribute``, or a `Model`.
+    params
+        Noise, calibration and initial belief; the model's defaults unless given. See
+        `jaxekf.load_parameters`.
+    smooth
+        Estimate each instant from the whole run (fixed-interval smoothing) instead of from the measurements
+        up to that instant. Innovations are those of the filter in both cases.
+    at
+        Additional output times: (N,) int64 nanoseconds on the recording's clock, or `jaxekf.every`. Without
+        it the instants are those of the measurements.
 
-    The instants are those at which something was measured. `at` asks for others: times (N,) in int64
-    nanoseconds on the recording's clock, or `jaxekf.every`; the estimate at these is `Estimate.requested`.
+    Returns
+    -------
+    Estimate
+        State, covariance, outputs and innovations at the instants of the measurements; with `at` also
+        `Estimate.requested`, the estimate at those times.
 
-    Raises `RecordingError` for what is wrong with the data or where nothing of `at` lies within the run,
-    `FilterError` where the recursion broke, `ResourceError` where memory is too small for it,
-    `PrecisionError` in float32.
+    Raises
+    ------
+    RecordingError
+        The recording does not fit the model, or no time in `at` is within the run.
+    ModelError
+        The model is unknown, or `at` is given for a model whose steps are the samples of one stream.
+    FilterError
+        A covariance is no longer finite and positive definite.
+    ResourceError
+        There is too little memory.
+    PrecisionError
+        JAX is not set to float64; see `jaxekf.set_up`.
 
     Examples
     --------
@@ -83,13 +107,34 @@ def estimate_many(
     params: Parameters | Sequence[Parameters] | None = None,
     *,
     smooth: bool = False,
-    at: Sequence[Requested | None] | Every | None = None,
+    at: Sequence[OutputTimes | None] | Every | None = None,
 ) -> list[Estimate]:
-    """Estimate several runs side by side, with the same parameters or a list of each run's own; equal to
-    one call for each.
+    """Estimate several runs in parallel; the results are those of one `estimate` for each.
 
-    `at` has an entry for each run, or is one grid for all. Raises `ValueError` where it is neither, and
-    what `estimate` raises.
+    Parameters
+    ----------
+    runs
+        Recordings, or paths of run folders.
+    model
+        As in `estimate`.
+    params
+        One set of parameters for all runs, or one set for each run.
+    smooth
+        As in `estimate`.
+    at
+        Additional output times of each run, None for a run without, or one grid for all runs.
+
+    Returns
+    -------
+    list of Estimate
+        In the order of `runs`.
+
+    Raises
+    ------
+    ValueError
+        The number of entries in `params` or `at` is not the number of runs.
+    RecordingError, ModelError, FilterError, ResourceError, PrecisionError
+        As in `estimate`.
 
     Examples
     --------
@@ -105,21 +150,21 @@ def estimate_many(
     if at is not None and len(at) != len(runs):
         raise ValueError(
             f"got requested times for {len(at)} runs, expected as many as the {len(runs)} runs; pass an"
-            " entry for each, None where nothing is asked for"
+            " entry for each, None for a run without requested times"
         )
     recordings = read(runs)
     chosen = adapted(get_model(model), recordings)
     timelines = timeline.build_many(chosen, recordings, at)
-    used = _of_each(chosen.parameters if params is None else params, len(runs))
+    used = _parameters_per_run(chosen.parameters if params is None else params, len(runs))
     results = filter_timelines(chosen, used, timelines, smooth=smooth)
     return [
-        _collect(chosen, own, recording, line, *result, smooth=smooth)
+        _as_estimate(chosen, own, recording, line, *result, smooth=smooth)
         for own, recording, line, result in zip(used, recordings, timelines, results, strict=True)
     ]
 
 
-def _of_each(params: Parameters | Sequence[Parameters], runs: int) -> list[Parameters]:
-    """The parameters of each run, checked."""
+def _parameters_per_run(params: Parameters | Sequence[Parameters], runs: int) -> list[Parameters]:
+    """The parameters of each run, after a check of their values."""
     if isinstance(params, Parameters):
         shared = parameters.as_arrays(params._replace(truth=()))
         parameters.check(shared)
@@ -129,22 +174,43 @@ def _of_each(params: Parameters | Sequence[Parameters], runs: int) -> list[Param
             f"got parameters for {len(params)} runs, expected as many as the {runs} runs; pass a set for"
             " each, or one for all"
         )
-    return [_of_each(own, 1)[0] for own in params]
+    return [_parameters_per_run(own, 1)[0] for own in params]
 
 
 def read(runs: Sequence[Run]) -> list[Recording]:
-    """The recordings of runs, those given as paths read from disk."""
+    """The recordings of runs; paths are read from disk."""
     return [run if isinstance(run, Recording) else run_folder.load(run) for run in runs]
 
 
 def filter_timelines(
     model: Model, params: Sequence[Parameters], lines: Sequence[Timeline], *, smooth: bool = False
 ) -> list[tuple[FilterOutput, dict[str, tuple[Array, Array]]]]:
-    """Filter runs side by side, each with its parameters, and check each; with `smooth` the updated
-    beliefs are the smoothed ones.
+    """Filter runs in parallel and check the result of each.
 
-    Runs of like length are padded to a common one out of a few, so that few programs are compiled; more
-    of them than fit into memory are taken one batch after the other.
+    Parameters
+    ----------
+    model
+        The model of all runs.
+    params
+        The parameters of each run.
+    lines
+        The timeline of each run. Runs of similar length are padded to one of a few lengths, so that few
+        programs are compiled, and are filtered in batches that fit into memory.
+    smooth
+        Put the smoothed beliefs in place of the filter's updated ones.
+
+    Returns
+    -------
+    list of (FilterOutput, dict)
+        For each run the filter's output and, by name, value and covariance of the model's outputs; leading
+        axes are (epochs, substeps), with padding.
+
+    Raises
+    ------
+    FilterError
+        A covariance is no longer finite and positive definite.
+    ResourceError
+        There is too little memory.
     """
     results: dict[int, Any] = {}
     for members in padding.groups(lines):
@@ -157,29 +223,29 @@ def filter_timelines(
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *starts)
         size = min(len(members), _batch(model, steps))
         for start in range(0, len(members), size):
-            # The last batch is filled with the last run: another size would be another program.
+            # The last run fills up the last batch, since another batch size would need another program.
             index = np.minimum(np.arange(start, start + size), len(members) - 1)
             given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (stacked, steps))
             devices = sharing_devices()
             names = [lines[i].name for i in members[start : start + size]]
             with memory.for_runs(names):
-                found = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
+                filtered = jax.tree.map(np.asarray, _run(model, devices, smooth, *given))
             for place in range(min(size, len(members) - start)):
-                one = jax.tree.map(lambda a, place=place: a[place], found)
+                one = jax.tree.map(lambda a, place=place: a[place], filtered)
                 _check(model, lines[members[start + place]], one[0])
                 results[members[start + place]] = one
     return [results[i] for i in range(len(lines))]
 
 
 def _batch(model: Model, steps: Steps) -> int:
-    """Number of runs to take at once."""
+    """Number of runs in one batch."""
     _, epochs, substeps = steps.dt.shape
     size = 8 * epochs * substeps * 4 * model.error_dim * (model.error_dim + 4)
     return max(1, _BATCH_BYTES // size)
 
 
 def sharing_devices() -> tuple[Any, ...]:
-    """The CPU devices to share runs among; none where there is one only."""
+    """The CPU devices to distribute runs over; empty if there is only one."""
     devices = jax.local_devices()
     shared = len(devices) > 1 and devices[0].platform == "cpu"
     return tuple(devices) if shared else ()
@@ -197,9 +263,9 @@ def _run(
     cov = jax.vmap(model.initial_covariance)(every)
     given = (model, every, Belief(means, cov), steps)
     if smooth:
-        found = smoother.run_smoother_batch(*given, devices=devices)
-        instants = found.filtered.instants._replace(updated=found.smoothed)
-        output = found.filtered._replace(instants=instants)
+        both = smoother.run_smoother_batch(*given, devices=devices)
+        instants = both.filtered.instants._replace(updated=both.smoothed)
+        output = both.filtered._replace(instants=instants)
     else:
         output = ekf.run_filter_batch(*given, devices=devices)
     return output, evaluate_outputs(model, every, output)
@@ -208,10 +274,10 @@ def _run(
 def evaluate_outputs(
     model: Model, params: Parameters, output: FilterOutput
 ) -> dict[str, tuple[Any, Array]]:
-    """Value and covariance of each of the model's outputs, leading axes (runs, K, S)."""
+    """Value and covariance of each output of the model by name, with leading axes (runs, K, S)."""
 
     def one(params: Parameters, belief: Belief, u: Any) -> dict[str, tuple[Any, Array]]:
-        found = {}
+        values = {}
         for out in model.outputs:
             value = out.value(belief.mean, u, params)
 
@@ -224,15 +290,15 @@ def evaluate_outputs(
             cov = jacobian @ belief.cov @ jacobian.T
             if out.noise is not None:
                 cov = cov + out.noise(u, params)
-            found[out.name] = (value, 0.5 * (cov + cov.T))
-        return found
+            values[out.name] = (value, 0.5 * (cov + cov.T))
+        return values
 
     over_steps = jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
     return jax.vmap(over_steps)(params, output.instants.updated, output.inputs)
 
 
 def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
-    """Raise for the first substep at which the recursion broke."""
+    """Raise `FilterError` for the first substep whose covariance is not finite and positive definite."""
     epochs, substeps = line.time_ns.shape
     healthy = np.asarray(output.instants.healthy)[:epochs, -substeps:]
     broken = np.argwhere(~healthy & line.valid)
@@ -240,17 +306,17 @@ def _check(model: Model, line: Timeline, output: FilterOutput) -> None:
         return
     k, s = (int(i) for i in broken[0])
     seconds = (line.time_ns[k, s] - line.time_ns[0, -1]) / NANOSECONDS
-    blamed = _blame(line, output, k, s)
+    place = _failed_update(line, output, k, s)
     raise FilterError(
         f"run '{line.name}': got a covariance that is not finite and definite at step {k * substeps + s},"
-        f" {seconds:.6f} s, {blamed} of model"
+        f" {seconds:.6f} s, {place} of model"
         f" '{model.name}', expected a definite one; look for noise that is zero, negative or not finite, or"
-        " for units, gravity_ref or frames that are not as stated (jaxekf check names what it can tell)"
+        " for wrong units, gravity_ref or frames in recording.toml (jaxekf check finds some of these)"
     )
 
 
-def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
-    """The sensors used at a broken substep, or the prediction where that was broken already."""
+def _failed_update(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
+    """The part of a failed substep that failed: the prediction, or the update by its sensors."""
     epochs, substeps = line.time_ns.shape
     beliefs: Any = output.instants.predicted
     predicted = np.asarray(beliefs.cov)[:epochs, -substeps:][k, s].diagonal()
@@ -266,10 +332,10 @@ def _blame(line: Timeline, output: FilterOutput, k: int, s: int) -> str:
     return f"in the update by sensor {' and '.join(used)}"
 
 
-def _rejected(record: SensorRecord, copies: int) -> int:
-    """Samples, or where they are made of like groups these, of which the gate let nothing in."""
+def _count_rejected(record: SensorRecord, copies: int) -> int:
+    """Number of samples that the gate rejected; of a sensor with `copies` groups, number of groups."""
     gated, used = (
-        # The width is stated, as an array without samples has none that NumPy could work out.
+        # The width is explicit, because NumPy cannot infer it for an array without samples.
         flags.reshape(len(flags) * copies, flags.shape[1] // copies).any(axis=1)
         for flags in (np.asarray(record.gated), np.asarray(record.used))
     )
@@ -281,7 +347,7 @@ def model_sensors(line: Timeline) -> list[str]:
     return [*line.steps.fast, *line.steps.slow]
 
 
-def _collect(
+def _as_estimate(
     model: Model,
     params: Parameters,
     recording: Recording,
@@ -291,7 +357,7 @@ def _collect(
     *,
     smooth: bool,
 ) -> Estimate:
-    """The filter's arrays without padding, in order of time."""
+    """The estimate of one run from the filter's arrays, without padding."""
     epochs, substeps = line.time_ns.shape
     valid = line.valid
 
@@ -300,43 +366,43 @@ def _collect(
 
     belief: Belief = jax.tree.map(flat, output.instants.updated)
     sensors, account = {}, {name: dict(count) for name, count in line.account.items()}
-    refused: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     for name in model_sensors(line):
         fast = name in line.steps.fast
         rows = (line.steps.fast if fast else line.steps.slow)[name]
         record = _sensor_record(output.innovations[name], rows, line, fast)
         sensors[name] = record
-        if record.weight is not None and (little := _counts_little(record)):
-            refused += (
-                f"{little} of {len(record.time_ns)} samples of {name} count less than half, so far are they"
-                " off",
+        if record.weight is not None and (low_weight := _count_downweighted(record)):
+            warnings += (
+                f"{low_weight} of {len(record.time_ns)} samples of {name} have a robust weight below 0.5"
+                " because of large innovations",
             )
         if name in account:
-            rejected = _rejected(record, model.sensor(name).copies)
+            rejected = _count_rejected(record, model.sensor(name).copies)
             account[name]["gated"] = rejected
             fed = account[name].pop("fed")
             account[name]["used"] = fed - rejected
-            if rejected > _MANY_REFUSED * fed:
-                refused += (
-                    f"the gate refused {rejected} of {fed} samples of {name}, far more than chance does:"
+            if rejected > _HIGH_REJECTION * fed:
+                warnings += (
+                    f"the gate rejected {rejected} of {fed} samples of {name}, far more than by chance:"
                     " look for wrong noise, geometry, names, units or latency",
                 )
     for count in account.values():
         if "fed" in count:
             count["used"] = count.pop("fed")
-    notes = line.notes + refused
+    notes = line.notes + warnings
     if output.instants.recovered is not None and (opened := flat(output.instants.recovered)).any():
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
         notes += (
             f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
-            f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times;"
-            " if these samples are good, the noise is too small for so strict a gate: tune it, or take"
-            " weights instead (robust: huber)",
+            f" had rejected all samples for {model.patience_s} s and the covariance was inflated, {len(at)}"
+            " times; if these samples are good, the noise is too small for this gate: tune it, or use"
+            " robust weighting (robust: huber)",
         )
     if smooth:
-        notes += ("smoothed: every instant is estimated from the whole run",)
+        notes += ("smoothed: each instant is estimated from the whole run",)
     total = float(flat(output.instants.log_likelihood).sum())
-    made = Estimate(
+    estimated = Estimate(
         run=recording.name,
         model=model,
         time_ns=line.time_ns[valid],
@@ -349,7 +415,7 @@ def _collect(
         params=params._replace(setup=line.setup),
         notes=notes,
         smoothed=smooth,
-        # Absolute, so that it is found again from another working folder.
+        # Absolute, so that the report finds it from any working folder.
         provenance=provenance()
         | {
             "recording": str(recording.path.resolve() if recording.path else recording.name),
@@ -358,12 +424,12 @@ def _collect(
         },
     )
     if line.requested_ns is None or line.measured_ns is None:
-        return made
-    return made.split(np.isin(made.time_ns, line.measured_ns), line.requested_ns)
+        return estimated
+    return estimated.split(np.isin(estimated.time_ns, line.measured_ns), line.requested_ns)
 
 
 def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:
-    """Values and covariances of the model's outputs with their frames and units."""
+    """The model's outputs with frames and units."""
     named = {}
     for name, (value, cov) in outputs.items():
         out = model.output(name)
@@ -372,7 +438,7 @@ def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputE
 
 
 def _sensor_record(innovation: Any, rows: Any, line: Timeline, fast: bool) -> SensorRecord:
-    """One sensor's innovations at the instants at which it was sampled and seen."""
+    """One sensor's innovations at the instants of its visible samples."""
     epochs, substeps = line.time_ns.shape
     parts = jax.tree.map(
         lambda a: np.asarray(a)[:epochs, -substeps:] if fast else np.asarray(a)[:epochs], innovation
@@ -383,14 +449,14 @@ def _sensor_record(innovation: Any, rows: Any, line: Timeline, fast: bool) -> Se
     return SensorRecord(times[seen], *kept)
 
 
-def _counts_little(record: SensorRecord) -> int:
-    """Used samples of which some row counts less than half."""
+def _count_downweighted(record: SensorRecord) -> int:
+    """Number of used samples with a robust weight below 0.5 in at least one row."""
     assert record.weight is not None
     return int(((record.weight < 0.5) & record.used).any(axis=1).sum())
 
 
 def provenance() -> dict[str, Any]:
-    """Versions and settings that an estimate was made with."""
+    """Versions of the packages, precision and backend of an estimate."""
     names = ("jaxekf", "jax", "jaxlib", "numpy", "optax")
     return {
         "versions": {name: version(name) for name in names},

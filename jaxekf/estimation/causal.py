@@ -1,9 +1,9 @@
-"""What was known at each time: late measurements, as a system that runs live has them.
+"""Causal estimates with late measurements: at each time only the measurements that had arrived are used.
 
-A tracker's frame is known some time after it was taken. The past is then updated where the frame belongs
-and carried on to the present by the input (Tobergte, Pomarlan, Hirzinger 2009, section III.D). Offline
-every measurement simply stands at its own time; `estimate_online` tells what the live system would have
-said, and `jaxekf.estimation.live.Stream` is that system.
+A tracker's frame arrives some time after it was taken. The belief at the time of the frame is then updated,
+and extrapolated to the present by the input (Tobergte, Pomarlan, Hirzinger 2009, section III.D).
+`estimate_online` computes from a recording the estimates of such a live system; the live system itself is
+`jaxekf.estimation.live.Stream`.
 """
 
 from dataclasses import replace
@@ -37,39 +37,53 @@ from jaxekf.recordings.types import NANOSECONDS, Times, period_ns
 _EPOCHS_AT_ONCE = 2048
 
 
-class Outlook(NamedTuple):
-    """From the end of each epoch (E of them) the instants at which its belief was the latest known."""
+class Extrapolation(NamedTuple):
+    """For each of E epochs the A instants at which the belief at its end was the latest available one."""
 
     steps: Steps
-    """(E, A, 1) without samples and input: times since the start of the run."""
+    """(E, A, 1) prediction steps without samples and input; times since the start of the run."""
     time_ns: Times
     """(E, A)."""
-    wanted: NDArray[np.bool_]
-    """(E, A) where the belief, carried on to that instant, is what was known then."""
+    latest: NDArray[np.bool_]
+    """(E, A) whether the extrapolated belief is the latest one available at that instant."""
     knots: NDArray[np.intp]
-    """(E, W) the input's knots that are needed."""
+    """(E, W) indices of the input's knots that the steps need."""
 
-    def starting(self, first: int) -> "Outlook":
-        """Of the epochs from `first` on."""
+    def from_epoch(self, first: int) -> "Extrapolation":
+        """The same for the epochs from `first` on."""
         steps = jax.tree.map(lambda a: a[first:], self.steps)
-        return Outlook(steps, self.time_ns[first:], self.wanted[first:], self.knots[first:])
+        return Extrapolation(steps, self.time_ns[first:], self.latest[first:], self.knots[first:])
 
     def with_input(self, knots: Knots) -> Steps:
-        """The steps with their windows of the run's input; also under `vmap` of `knots`."""
+        """The steps with the input that they need; may be used under `vmap` of `knots`."""
         return self.steps._replace(knots=jax.tree.map(lambda a: a[self.knots], knots))
 
 
-def outlook(line: Timeline, latency_ns: int, shift_s: float = 0.0) -> Outlook:
-    """Where the belief after each epoch of a timeline has to be carried on to.
+def plan_extrapolation(line: Timeline, latency_ns: int, shift_s: float = 0.0) -> Extrapolation:
+    """The instants to which the belief after each epoch of a timeline is extrapolated.
 
-    The belief at time s is known from ``s + latency_ns`` on until the next is; it is told at every sample
-    of the input in between. `shift_s` is the most that the input's clock is off. The input is taken as
-    known up to the instant it is asked at: with a latency shorter than the input's period use `Stream`.
+    The belief at time s is available from ``s + latency_ns`` until the next one is; it is extrapolated to
+    every sample of the input in between. The input is assumed to have no latency: for a tracker latency
+    shorter than the input's period use `Stream`.
+
+    Parameters
+    ----------
+    line
+        The timeline of a model with an input.
+    latency_ns
+        Latency of the measurements.
+    shift_s
+        Largest absolute clock offset of the input, s.
+
+    Raises
+    ------
+    ModelError
+        The model has no input.
     """
     if line.steps.knots is None:
         raise ModelError(
-            f"run '{line.name}': got a model without input, expected one to carry beliefs on by; take"
-            " the ordinary estimate, which only looks back"
+            f"run '{line.name}': got a model without input, expected one to extrapolate by; use"
+            " jaxekf.estimate, which does not extrapolate"
         )
     start = int(line.time_ns[0, -1]) - round(float(line.steps.time[0, -1]) * NANOSECONDS)
     samples = start + np.round(np.asarray(line.steps.knots.time) * NANOSECONDS).astype(np.int64)
@@ -92,88 +106,111 @@ def outlook(line: Timeline, latency_ns: int, shift_s: float = 0.0) -> Outlook:
     steps = Steps(
         ((times - start) / NANOSECONDS)[..., None], dt[..., None], valid[..., None], None, {}, {}
     )
-    return Outlook(steps, times, valid & (times >= known[:, None]), window)
+    return Extrapolation(steps, times, valid & (times >= known[:, None]), window)
 
 
-def carry_on(
+def extrapolate(
     model: Model, params: Parameters, beliefs: Belief, steps: Steps, keep: ekf.Keep = "estimates"
 ) -> ekf.FilterOutput:
-    """Beliefs (E, ...) carried on over `Outlook.with_input`'s steps; `params` for each of them."""
+    """Extrapolate beliefs (E, ...) over the steps of `Extrapolation.with_input`; `params` (E, ...)."""
     return ekf.run_filter_batch(model, params, beliefs, steps, keep=keep, devices=sharing_devices())
 
 
 @partial(jit, static_argnums=0)
-def _told(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -> Any:
+def _extrapolated_outputs(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -> Any:
     count = steps.dt.shape[0]
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *jnp.shape(a))), params)
-    output = carry_on(model, every, beliefs, steps)
+    output = extrapolate(model, every, beliefs, steps)
     return output.instants.updated, evaluate_outputs(model, every, output)
 
 
 def estimate_online(
     run: Run, model: str | Model = "tight", params: Parameters | None = None
 ) -> Estimate:
-    """As `jaxekf.estimate`, but at each sample of the input only with what had arrived by then.
+    """Estimate one run as a live system: at each input sample only with measurements that had arrived.
 
-    It begins when the first measurement has arrived. Raises what `estimate` raises, and `ModelError` for
-    a model without input or sensors whose latencies differ (use `Stream`).
+    Parameters
+    ----------
+    run
+        A `Recording`, or the path of a run folder.
+    model
+        Name of a model with an input, ``module:attribute``, or a `Model`.
+    params
+        As in `jaxekf.estimate`.
+
+    Returns
+    -------
+    Estimate
+        At the samples of the input, from the arrival of the first measurement on.
+
+    Raises
+    ------
+    ModelError
+        The model has no input, or its sensors have different latencies (then use `Stream`).
+    RecordingError, FilterError, ResourceError, PrecisionError
+        As in `jaxekf.estimate`.
     """
     recording = read([run])[0]
     _need_input(get_model(model))
-    made = estimate_many([recording], model, params)[0]
-    line = timeline.build(made.model, recording)
+    filtered = estimate_many([recording], model, params)[0]
+    line = timeline.build(filtered.model, recording)
     latency = set(line.latency_ns.values())
     if len(latency) != 1:
         raise ModelError(
             f"run '{line.name}': got sensors with latencies of {sorted(line.latency_ns.items())} ns,"
-            " expected one for all; feed a jaxekf.Stream instead"
+            " expected the same for all; use a jaxekf.Stream instead"
         )
-    chosen, late = made.model, latency.pop()
+    chosen, late = filtered.model, latency.pop()
     shift = 0.0
     if chosen.input is not None:
         shift = float(
-            jnp.max(jnp.abs(chosen.input.shift(made.params, jnp.asarray(line.steps.time))))
+            jnp.max(jnp.abs(chosen.input.shift(filtered.params, jnp.asarray(line.steps.time))))
         )
-    view = outlook(line, late, shift)
-    at = np.searchsorted(made.time_ns, line.time_ns[:, -1])
-    beliefs = Belief(jax.tree.map(lambda a: a[at], made.state), jnp.asarray(made.cov[at]))
-    told = _in_parts(chosen, made.params, beliefs, view.with_input(_knots(line)))
-    belief, outputs = jax.tree.map(lambda a: a[:, :, 0][view.wanted], told)
+    view = plan_extrapolation(line, late, shift)
+    at = np.searchsorted(filtered.time_ns, line.time_ns[:, -1])
+    beliefs = Belief(jax.tree.map(lambda a: a[at], filtered.state), jnp.asarray(filtered.cov[at]))
+    extrapolated = _extrapolate_in_batches(
+        chosen, filtered.params, beliefs, view.with_input(_knots(line))
+    )
+    belief, outputs = jax.tree.map(lambda a: a[:, :, 0][view.latest], extrapolated)
     return replace(
-        made,
-        time_ns=view.time_ns[view.wanted],
+        filtered,
+        time_ns=view.time_ns[view.latest],
         state=belief.mean,
         cov=belief.cov,
         outputs=named_outputs(chosen, outputs),
         online=True,
-        notes=(*made.notes, f"what was known at each time, measurements {late / 1e6:g} ms late"),
+        notes=(
+            *filtered.notes,
+            f"causal: only measurements that had arrived, {late / 1e6:g} ms late",
+        ),
     )
 
 
 def _need_input(model: Model) -> None:
-    """Raise for a model that has nothing to carry it on to the present, before it is run."""
+    """Raise `ModelError` for a model without input, before it is run."""
     if model.input is None:
         driven = ", ".join(name for name, other in REGISTRY.items() if other.input is not None)
         raise ModelError(
-            f"got the model '{model.name}' without input, expected one that its input carries on to the"
-            f" present ({driven}); try one of these, or the estimate that is not online"
+            f"got the model '{model.name}' without input, expected one with an input to extrapolate by"
+            f" ({driven}); use one of these, or the estimate that is not online"
         )
 
 
 def _knots(line: Timeline) -> Knots:
-    assert line.steps.knots is not None  # `outlook` has refused a line without
+    assert line.steps.knots is not None  # `plan_extrapolation` has raised for a timeline without
     return line.steps.knots
 
 
-def _in_parts(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -> Any:
-    """`_told` of a few thousand epochs at a time, so that memory is bounded."""
+def _extrapolate_in_batches(model: Model, params: Parameters, beliefs: Belief, steps: Steps) -> Any:
+    """`_extrapolated_outputs` in batches of epochs, so that memory is bounded."""
     count = steps.dt.shape[0]
     size = min(count, _EPOCHS_AT_ONCE)
     parts = []
     for start in range(0, count, size):
-        # The last part is filled with the last epoch: another size would be another program.
+        # The last epoch fills up the last batch, since another size would need another program.
         index = np.minimum(np.arange(start, start + size), count - 1)
         given = jax.tree.map(lambda a, index=index: np.asarray(a)[index], (beliefs, steps))
-        found = jax.tree.map(np.asarray, _told(model, params, *given))
-        parts.append(jax.tree.map(lambda a, s=start: a[: min(size, count - s)], found))
+        batch = jax.tree.map(np.asarray, _extrapolated_outputs(model, params, *given))
+        parts.append(jax.tree.map(lambda a, s=start: a[: min(size, count - s)], batch))
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)

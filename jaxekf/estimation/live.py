@@ -1,4 +1,4 @@
-"""A run estimated while it is recorded: late measurements update the past, the input carries it on."""
+"""Live estimates: late measurements update past beliefs, the input extrapolates them to the present."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -22,16 +22,16 @@ from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S
 from jaxekf.recordings.types import NANOSECONDS, Floats
 
 _INPUT_KEPT_NS = NANOSECONDS
-"""The input before the horizon that a clock offset may reach back to."""
+"""Input kept before the horizon, ns, because a clock offset may need it."""
 
 
 class Known(NamedTuple):
-    """What is known at an instant."""
+    """The estimate at one instant."""
 
     time_ns: int
     belief: Belief
     outputs: dict[str, tuple[Any, Any]]
-    """Value and covariance of each of the model's outputs."""
+    """Value and covariance of each output of the model, by name."""
 
 
 class _Sample(NamedTuple):
@@ -41,14 +41,34 @@ class _Sample(NamedTuple):
 
 
 class Stream:
-    """Feed it what arrives, in whatever order, and ask what is known.
+    """A live filter: it takes samples as they arrive, in any order, and estimates the present.
 
     Beliefs older than `horizon_s` before the latest input are final: a sample taken before them is too
-    late, is not used, and is counted in `dropped`. Everything within the horizon is filtered again at each
-    question, so that the answer is that of `jaxekf.run_filter` on all that has arrived; at most `capacity`
-    instants are kept open. The first question compiles.
+    late, is not used, and is counted in `dropped`. Each call of `known` filters everything within the
+    horizon again, so that its result is that of `jaxekf.run_filter` on all samples so far. The first call
+    compiles.
 
-    `belief` is that of the instant `start_ns`; samples taken at that instant are used.
+    Parameters
+    ----------
+    model
+        A model with an input, such as ``tight``.
+    params
+        Noise, calibration and setup.
+    belief
+        Mean and covariance at `start_ns`; samples taken at that time are used.
+    start_ns
+        Time of the initial belief, int64 nanoseconds.
+    horizon_s
+        Longest latency of a measurement, s.
+    capacity
+        Largest number of instants within the horizon; more are made final earlier.
+
+    Raises
+    ------
+    ModelError
+        The model has no input.
+    PrecisionError
+        JAX is not set to float64; see `jaxekf.set_up`.
     """
 
     def __init__(
@@ -64,8 +84,8 @@ class Stream:
         require_float64()
         if model.input is None:
             raise ModelError(
-                f"model '{model.name}': got no input, expected one to carry beliefs on by; name a model"
-                " with an input, such as tight"
+                f"model '{model.name}': got no input, expected one to extrapolate by; use a model with an"
+                " input, such as tight"
             )
         self.model, self.params = model, as_arrays(params)
         self.dropped: dict[str, int] = {sensor.name: 0 for sensor in model.sensors}
@@ -79,9 +99,19 @@ class Stream:
         self._samples: dict[int, dict[str, _Sample]] = {}
 
     def put_input(self, time_ns: int, value: Any) -> None:
-        """A sample of the input, such as the IMU's; they come in order of time.
+        """Add a sample of the input, such as the IMU, in order of time.
 
-        Raises `ModelError` for a time that does not increase, and after a gap too long to bridge.
+        Parameters
+        ----------
+        time_ns
+            Time of the sample, int64 nanoseconds.
+        value
+            (C,) the sample, in the units of the model's input.
+
+        Raises
+        ------
+        ModelError
+            The time does not increase, the gap before it is too long, or the shape differs from before.
         """
         if self._times and time_ns <= self._times[-1]:
             raise ModelError(
@@ -93,14 +123,14 @@ class Stream:
         if time_ns - before > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * usual):
             raise ModelError(
                 f"got an input {(time_ns - before) / NANOSECONDS:.3f} s after the last, expected no"
-                f" gap over {LONGEST_INPUT_GAP_S} s, for nothing is made up there; start a new stream"
-                " from a belief after the gap"
+                f" gap over {LONGEST_INPUT_GAP_S} s, because the input is not extrapolated; start a new"
+                " stream from a belief after the gap"
             )
         sample = np.asarray(value, float)
         if self._values and sample.shape != self._values[0].shape:
             raise ModelError(
-                f"got an input of shape {sample.shape}, expected {self._values[0].shape} as before; put"
-                " every sample in whole"
+                f"got an input of shape {sample.shape}, expected {self._values[0].shape} as before; pass"
+                " all channels of every sample"
             )
         self._times.append(int(time_ns))
         self._values.append(sample)
@@ -108,24 +138,56 @@ class Stream:
     def put(
         self, sensor: str, taken_ns: int, value: Any, *, mask: Any = True, aux: Any = None
     ) -> bool:
-        """A sample of a sensor, with the time it was *taken*; whether it is in time to be used."""
-        found = self.model.sensor(sensor)
+        """Add a sample of a sensor.
+
+        Parameters
+        ----------
+        sensor
+            Name of a sensor of the model.
+        taken_ns
+            Time at which the sample was *taken*, not that of its arrival, int64 nanoseconds.
+        value
+            The sample, of the shapes of the sensor's space.
+        mask
+            (rows,) whether each row of the sample is visible; one flag for all rows.
+        aux
+            Auxiliary data of the sample, if the sensor has it.
+
+        Returns
+        -------
+        bool
+            Whether the sample is used; False for one that is older than the horizon.
+
+        Raises
+        ------
+        ModelError
+            The model has no such sensor, or the sample does not have the shapes of its space.
+        """
+        definition = self.model.sensor(sensor)
         late = taken_ns < self._base_ns or (taken_ns == self._base_ns and not self._base_is_open)
         if late:
             self.dropped[sensor] += 1
             return False
-        _check_shapes(found, value)
-        rows = np.broadcast_to(np.asarray(mask, bool), found.rows)
-        aux = found.aux_like if aux is None else aux
+        _check_shapes(definition, value)
+        rows = np.broadcast_to(np.asarray(mask, bool), definition.rows)
+        aux = definition.aux_like if aux is None else aux
         self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
         return True
 
     def known(self) -> Known:
-        """What is known at the latest sample of the input."""
+        """Estimate the instant of the latest input sample, from all samples so far.
+
+        Raises
+        ------
+        ModelError
+            There are fewer than two samples of the input.
+        FilterError
+            A covariance is no longer finite and positive definite.
+        """
         if len(self._times) < 2 or self._times[-1] < self._base_ns:
             raise ModelError(
                 f"got {len(self._times)} samples of the input from {self._base_ns} ns on, expected two;"
-                " ask later"
+                " call known after more input"
             )
         now = self._times[-1]
         while True:
@@ -139,38 +201,38 @@ class Stream:
         return Known(now, belief, outputs)
 
     def _open_instants(self, now: int) -> list[int]:
-        """Instants that are not final: of the input, and of samples up to `now`."""
+        """Instants up to `now` that are not final: those of the input and of the samples."""
         first = self._base_ns if self._base_is_open else self._base_ns + 1
         times = {t for t in self._times if first <= t <= now}
         return sorted(times | {t for t in self._samples if t <= now})
 
     def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
-        """Filter over these instants; the first `final` of them become final."""
+        """Filter over these instants, make the first `final` of them final, and return the last belief."""
         steps = self._steps(instants)
         output, outputs = _advance(self.model, self.params, self._belief, self._refused, steps)
         count = len(instants)
         if not np.asarray(output.instants.healthy)[:count].all():
             raise FilterError(
                 f"got a covariance that is not finite and definite between {instants[0]} and"
-                f" {instants[-1]} ns, expected a definite one; look for wrong units in what was put in"
+                f" {instants[-1]} ns, expected a definite one; check the units of the samples"
             )
         if final:
             self._belief = jax.tree.map(lambda a: a[final - 1, 0], output.instants.updated)
             if output.instants.refused is not None:
                 self._refused = output.instants.refused[final - 1, 0]
-            self._settle(instants[final - 1])
+            self._discard_before(instants[final - 1])
         last = jax.tree.map(lambda a: a[count - 1, 0], output.instants.updated)
         return last, jax.tree.map(lambda a: a[count - 1, 0], outputs)
 
-    def _settle(self, time_ns: int) -> None:
-        """Forget what is before an instant that has become final."""
+    def _discard_before(self, time_ns: int) -> None:
+        """Discard the samples before an instant that has become final."""
         self._base_ns, self._base_is_open = time_ns, False
         self._samples = {t: s for t, s in self._samples.items() if t > time_ns}
         kept = sum(1 for t in self._times if t < time_ns - _INPUT_KEPT_NS)
         del self._times[:kept], self._values[:kept]
 
     def _steps(self, instants: list[int]) -> Steps:
-        """Epochs of one substep, filled up to the capacity by inert ones."""
+        """Epochs of one substep each, padded to the capacity."""
         times = np.array(instants, np.int64)
         dt = np.diff(times, prepend=self._base_ns) / NANOSECONDS
         time = (times - self._start_ns) / NANOSECONDS
@@ -182,35 +244,35 @@ class Stream:
         return padding.pad(steps, self._capacity, 1, knots)
 
     def _rows(self, sensor: Sensor, instants: list[int]) -> Rows:
-        """A sensor's samples at the instants, masked where there is none."""
+        """A sensor's samples at these instants, masked at instants without one."""
         blank = _Sample(
-            _blank(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.aux_like)
+            _zeros(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.aux_like)
         )
-        found = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
+        samples = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
         value, mask, aux = (
             jax.tree.map(lambda *a: np.stack([np.asarray(x) for x in a])[:, None], *parts)
-            for parts in zip(*found, strict=True)
+            for parts in zip(*samples, strict=True)
         )
         return Rows(value, aux, mask, np.full((len(instants), 1), self._period(sensor.name)))
 
     def _period(self, sensor: str) -> float:
-        """Seconds between the sensor's open samples; only a gate's patience counts them."""
+        """Median period of the sensor's samples within the horizon, s; used only by `Model.patience_s`."""
         times = sorted(t for t, s in self._samples.items() if sensor in s)
         return float(np.median(np.diff(times))) / NANOSECONDS if len(times) > 1 else 0.0
 
 
 def _check_shapes(sensor: Sensor, value: Any) -> None:
-    """Raise `ModelError` for a sample that is not of the sensor's space."""
-    expected = [np.shape(leaf) for leaf in jax.tree.leaves(_blank(sensor.space))]
+    """Raise `ModelError` for a sample that does not have the shapes of the sensor's space."""
+    expected = [np.shape(leaf) for leaf in jax.tree.leaves(_zeros(sensor.space))]
     got = [np.shape(leaf) for leaf in jax.tree.leaves(value)]
     if got != expected:
         raise ModelError(
-            f"sensor '{sensor.name}': got a sample of shapes {got}, expected {expected}; give it as the"
-            " sensor's space has it"
+            f"sensor '{sensor.name}': got a sample of shapes {got}, expected {expected}; pass it in the"
+            " sensor's space"
         )
 
 
-def _blank(space: Any) -> Any:
+def _zeros(space: Any) -> Any:
     return jax.tree.map(
         lambda part: np.zeros(part.shape),
         space,
@@ -226,7 +288,7 @@ def _as_floats(tree: Any) -> Any:
 def _advance(
     model: Model, params: Parameters, belief: Belief, refused: Any, steps: Steps
 ) -> tuple[ekf.FilterOutput, Mapping[str, Any]]:
-    """One window filtered, and the outputs at its instants."""
+    """Filter one window, and evaluate the model's outputs at its instants."""
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
     gated = any(sensor.gate is not None for sensor in model.sensors)
     output = ekf.run_filter_batch(model, *one[:3], refused=one[3] if gated else None)

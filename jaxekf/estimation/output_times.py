@@ -1,7 +1,7 @@
-"""Instants at which an estimate is asked for, besides those at which something was measured.
+"""Output times: instants of an estimate in addition to those of the measurements.
 
-They enter the timeline as instants without samples, so that what is told there is the filter's (or
-smoother's) own belief and not an interpolation.
+They are instants of the timeline without samples, so that the estimate there is the filter's or smoother's
+own belief and not an interpolation.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,13 @@ _MOST = 5_000_000
 
 @dataclass(frozen=True)
 class Every:
-    """A regular grid of instants from the first of a run on; see `every`. Raises `ValueError` for a period
-    that is no positive whole number."""
+    """A regular grid of output times that begins at the first instant of a run; see `every`.
+
+    Raises
+    ------
+    ValueError
+        The period is not a positive integer.
+    """
 
     period_ns: int
 
@@ -32,25 +37,54 @@ class Every:
             )
 
 
-Requested = Times | Every
-"""Times (N,) int64 nanoseconds on the recording's clock, or a grid."""
+OutputTimes = Times | Every
+"""Output times (N,) in int64 nanoseconds on the recording's clock, or a grid."""
 
 
 def every(seconds: float) -> Every:
-    """Instants of a run at this distance, the first of them where the run begins: for ``estimate(at=...)``.
+    """A regular grid of output times, for ``estimate(at=...)``.
 
-    Raises `ValueError` for a distance that is not at least a nanosecond.
+    Parameters
+    ----------
+    seconds
+        Period of the grid in seconds, at least 1e-9.
+
+    Returns
+    -------
+    Every
+        The grid. It begins at the first instant of the run that is estimated.
+
+    Raises
+    ------
+    ValueError
+        The period is less than a nanosecond or not finite.
     """
     period = float(seconds) * NANOSECONDS
     if not 1.0 <= period < np.inf:
         raise ValueError(
-            f"got a distance of {seconds} s, expected a nanosecond or more; pass seconds, such as 0.01"
+            f"got a period of {seconds} s, expected a nanosecond or more; pass seconds, such as 0.01"
         )
     return Every(round(period))
 
 
-def read_requested(path: Path | str) -> Times:
-    """The column ``time`` of a CSV file, decimal seconds on the recording's clock; others are not read."""
+def read_output_times(path: Path | str) -> Times:
+    """Read output times from a CSV file.
+
+    Parameters
+    ----------
+    path
+        A file with the column ``time``, decimal seconds on the recording's clock; others are ignored.
+
+    Returns
+    -------
+    Times
+        (N,) int64 nanoseconds.
+
+    Raises
+    ------
+    RecordingError
+        There is no such file, or it has no column of times.
+    """
     if not Path(path).is_file():
         raise RecordingError(path, "no such file", "a CSV file of times", "another path")
     table = read_table(Path(path))
@@ -58,23 +92,44 @@ def read_requested(path: Path | str) -> Times:
     return read_times(table)
 
 
-def within(asked: Any, start: int, end: int, place: Path | str) -> tuple[Times, str | None]:
-    """What was asked for of a run from `start` to `end`, ns, and a note on what lies outside of it.
+def select_output_times(
+    requested: Any, start: int, end: int, place: Path | str
+) -> tuple[Times, str | None]:
+    """The output times within a run.
 
-    Raises `RecordingError` where nothing lies inside, where times do not increase or are not integers.
+    Parameters
+    ----------
+    requested
+        Times (N,) int64 nanoseconds, or a grid.
+    start, end
+        First and last instant of the run, ns.
+    place
+        The recording, for error messages.
+
+    Returns
+    -------
+    Times
+        The requested times from `start` to `end`, (M,) int64 nanoseconds.
+    str or None
+        A note on the times that are outside the run.
+
+    Raises
+    ------
+    RecordingError
+        No time is within the run, or the times do not increase, are not integers, or are too many.
     """
-    if isinstance(asked, Every):
-        count = (end - start) // asked.period_ns + 1
+    if isinstance(requested, Every):
+        count = (end - start) // requested.period_ns + 1
         if count > _MOST:
             raise RecordingError(
                 place,
-                f"{count} instants {asked.period_ns} ns apart",
+                f"{count} instants {requested.period_ns} ns apart",
                 f"no more than {_MOST}",
-                "a longer distance between them",
+                "a longer period",
             )
-        return start + asked.period_ns * np.arange(count, dtype=np.int64), None
-    times = np.asarray(asked)
-    if times.ndim != 1 or times.dtype.kind not in "iu" or np.ma.isMaskedArray(asked):
+        return start + requested.period_ns * np.arange(count, dtype=np.int64), None
+    times = np.asarray(requested)
+    if times.ndim != 1 or times.dtype.kind not in "iu" or np.ma.isMaskedArray(requested):
         raise RecordingError(
             place,
             f"requested times of type {times.dtype} and shape {times.shape}, or masked",
@@ -98,4 +153,4 @@ def within(asked: Any, start: int, end: int, place: Path | str) -> tuple[Times, 
     if len(inside) == len(times):
         return inside, None
     left = len(times) - len(inside)
-    return inside, f"{left} of {len(times)} requested times lie outside the run, {run}: left out"
+    return inside, f"{left} of {len(times)} requested times are outside the run, {run}: left out"

@@ -1,4 +1,4 @@
-"""Runs of unequal length as one array: padding that is inert, in a few sizes for few compilations."""
+"""Runs of different lengths stacked, with inert padding to a few lengths: few programs are compiled."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,9 +12,24 @@ from jaxekf.filtering.steps import Knots, Rows, Steps
 
 
 def stack(timelines: Sequence[Timeline], epochs: int = 0, knots: int = 0) -> Steps:
-    """The steps of several runs on a new leading axis, the shorter ones padded by inert steps.
+    """The steps of several runs on a new leading axis, the shorter ones padded with inert steps.
 
-    They come out with at least `epochs` epochs and `knots` knots of the input.
+    Parameters
+    ----------
+    timelines
+        The runs.
+    epochs, knots
+        Least number of epochs and of knots of the input after padding.
+
+    Returns
+    -------
+    Steps
+        With leading axes (runs, epochs, substeps).
+
+    Raises
+    ------
+    ModelError
+        There is no run.
     """
     if not timelines:
         raise ModelError("got no run to stack, expected at least one; name some recordings")
@@ -27,7 +42,7 @@ def stack(timelines: Sequence[Timeline], epochs: int = 0, knots: int = 0) -> Ste
 
 
 def bucketed(timelines: Sequence[Timeline]) -> Steps:
-    """Stacked steps, padded to one of a few lengths so that few programs are ever compiled."""
+    """As `stack`, padded to one of the lengths of `bucket`, so that few programs are compiled."""
     if not timelines:
         return stack(timelines)
     epochs = max(line.steps.dt.shape[0] for line in timelines)
@@ -36,12 +51,12 @@ def bucketed(timelines: Sequence[Timeline]) -> Steps:
 
 
 def groups(timelines: Sequence[Timeline]) -> list[list[int]]:
-    """The runs that are padded to one length together, as places in the sequence, shortest first."""
-    found: dict[tuple[int, int], list[int]] = {}
+    """Indices of the runs that are padded to the same length, for each length, the shortest first."""
+    by_length: dict[tuple[int, int], list[int]] = {}
     for i, line in enumerate(timelines):
         epochs, substeps = line.steps.dt.shape
-        found.setdefault((bucket(epochs), substeps), []).append(i)
-    return [found[key] for key in sorted(found)]
+        by_length.setdefault((bucket(epochs), substeps), []).append(i)
+    return [by_length[key] for key in sorted(by_length)]
 
 
 def _knot_count(steps: Steps) -> int:
@@ -49,7 +64,7 @@ def _knot_count(steps: Steps) -> int:
 
 
 def bucket(count: int) -> int:
-    """The next of a few sizes, at most a quarter above `count`: 1, 1.25, 1.5 or 1.75 powers of two."""
+    """The smallest size of at least `count` out of 1, 1.25, 1.5 and 1.75 times powers of two."""
     if count <= 4:
         return count
     power = 1 << (count.bit_length() - 1)
@@ -57,8 +72,19 @@ def bucket(count: int) -> int:
 
 
 def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> Steps:
-    """Steps with inert epochs added at the end, inert substeps in front of each epoch, and the input's
-    knots, where a number is given, made up to it."""
+    """Pad the steps of one run with inert ones, which do not change its estimate.
+
+    Parameters
+    ----------
+    steps
+        Steps with leading axes (K, S).
+    epochs
+        Number of epochs; inert ones are added at the end.
+    substeps
+        Number of substeps of each epoch; inert ones are added in front.
+    knots
+        Number of knots of the input; None leaves them as they are.
+    """
     more_epochs = epochs - steps.dt.shape[0]
     more_substeps = substeps - steps.dt.shape[1]
 
@@ -88,8 +114,8 @@ def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> S
 
 
 def _pad_knots(knots: Knots | None, count: int) -> Knots | None:
-    """Knots up to `count` that hold the last value, as far apart as the last two: what is read at the
-    last one, its noise bandwidth included, does not change."""
+    """Add knots up to `count` that hold the last value, at the period of the last two, so that the input
+    and its noise bandwidth at the last knot do not change."""
     if knots is None or len(knots.time) >= count:
         return knots
     apart = knots.time[-1] - knots.time[-2] if len(knots.time) > 1 else 1.0

@@ -1,4 +1,4 @@
-"""Noise, calibration and initial belief as TOML files with units and where they came from."""
+"""Noise, calibration and initial belief as TOML files, with units and origin."""
 
 import tomllib
 from collections.abc import Collection, Mapping
@@ -19,19 +19,19 @@ _SECTIONS = ("noise", "calibration", "initial")
 
 
 def as_arrays(params: Parameters) -> Parameters:
-    """The same tree with float arrays at its leaves."""
+    """The parameters with float arrays as leaves."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
 
 
 def for_runs(params: Parameters, setup: Any, runs: int) -> Parameters:
-    """The same parameters for each of several runs, on a new first axis, each with its own setup."""
+    """The same parameters for each of several runs, on a new leading axis that `setup` has already."""
     shared = params._replace(setup=())
     every = jax.tree.map(lambda a: jnp.broadcast_to(a, (runs, *jnp.shape(a))), shared)
     return every._replace(setup=setup)
 
 
 def leaf_names(section: Any) -> list[str]:
-    """Dotted name of each leaf of a pytree of parameters, in the order of its leaves."""
+    """Dotted names of the leaves of a pytree of parameters, in the order of its leaves."""
     paths = jax.tree_util.tree_flatten_with_path(section)[0]
     return [
         ".".join(str(getattr(k, "name", getattr(k, "key", k))) for k in path) for path, _ in paths
@@ -39,7 +39,7 @@ def leaf_names(section: Any) -> list[str]:
 
 
 def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> dict[str, Any]:
-    """A TOML document: each leaf with its value and unit."""
+    """Parameters as a TOML document; each leaf has its value and unit."""
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "model": model.name,
@@ -62,30 +62,44 @@ def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> 
 def described_arrays(model: Model, params: Parameters) -> dict[str, tuple[Any, str]]:
     """Each parameter as an array with its unit, by ``section/name``.
 
-    The setup, which a recording tells, has no units in a model: it is in SI units.
+    The setup, which comes from the recording, is in SI units.
     """
-    found = {}
+    described = {}
     for section in (*_SECTIONS, "setup"):
         values, units = getattr(params, section), getattr(model.units, section)
         names, leaves = leaf_names(values), jax.tree.leaves(values)
-        said = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
-        for name, leaf, unit in zip(names, leaves, said, strict=True):
-            found[f"{section}/{name}"] = (np.asarray(leaf), unit)
-    return found
+        unit_names = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
+        for name, leaf, unit in zip(names, leaves, unit_names, strict=True):
+            described[f"{section}/{name}"] = (np.asarray(leaf), unit)
+    return described
 
 
 def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str, Any]) -> None:
-    """Write `noise.toml` (noise and initial belief) and `calibration.toml` into a folder, each whole.
+    """Write parameters into a folder: `noise.toml` (noise and initial belief) and `calibration.toml`.
 
-    Raises `ModelError` for deviations that are not positive and finite.
+    Each file is written atomically. ``value_deg`` beside a value in radians is for reading only.
 
-    ``value_deg`` beside a value in radians is for reading only.
+    Parameters
+    ----------
+    path
+        An existing folder.
+    model
+        The model of the parameters, for their names and units.
+    params
+        The parameters to write.
+    origin
+        How they were found, for the section ``origin``.
+
+    Raises
+    ------
+    ModelError
+        A standard deviation is not positive and finite.
     """
     save_noise(path, model, params, origin)
     if leaf_names(params.calibration):
         save_calibration(path, model, params, origin)
     else:
-        # What an earlier model left there must not be read beside this one's noise.
+        # The calibration of another model must not be read with this noise.
         (Path(path) / "calibration.toml").unlink(missing_ok=True)
 
 
@@ -105,8 +119,8 @@ def save_calibration(
 
 
 def forget(folder: Path, keep: Collection[str]) -> None:
-    """Remove the parameter files of an earlier result from the folders in `folder`, except those of some
-    names; anything else there stays."""
+    """Remove the parameter files of an earlier result from the folders in `folder`, except from those named
+    in `keep`; other files stay."""
     for old in sorted(folder.iterdir()) if folder.is_dir() else ():
         if old.name in keep or not old.is_dir():
             continue
@@ -131,9 +145,27 @@ def _write(
 
 
 def load(model: Model, *paths: Path | str) -> Parameters:
-    """The model's defaults with what the given files say instead.
+    """The model's default parameters, with the values of files in place of the defaults.
 
-    A folder stands for the `noise.toml` and `calibration.toml` in it.
+    Parameters
+    ----------
+    model
+        The model. The files must name it.
+    paths
+        Files such as `noise.toml` and `calibration.toml`, or folders with these files; a later file
+        overrides an earlier one.
+
+    Returns
+    -------
+    Parameters
+        Float arrays, in the units of `Model.units`.
+
+    Raises
+    ------
+    RecordingError
+        A file is missing, is not TOML, or has other entries, units or shapes than the model.
+    ModelError
+        A file is of another model, or a standard deviation is not positive and finite.
     """
     params = model.parameters
     for path in map(Path, paths):
@@ -145,32 +177,32 @@ def load(model: Model, *paths: Path | str) -> Parameters:
         documents = {file: _document(file) for file in files}
         _check_together(path, list(documents.values()))
         for file, document in documents.items():
-            params = _filled(file, document, model, params)
+            params = _with_document(file, document, model, params)
     return as_arrays(params)
 
 
 def _check_together(folder: Path, documents: list[dict[str, Any]]) -> None:
-    """Files of one folder that tell of which tuning they are must be of one."""
+    """Raise `RecordingError` if the files of one folder come from different tunings."""
     origins = [document.get("origin") for document in documents]
     tunings = {o["tuning"] for o in origins if isinstance(o, dict) and "tuning" in o}
     if len(tunings) > 1:
         raise RecordingError(
             folder,
             f"noise.toml and calibration.toml of the tunings {' and '.join(sorted(map(str, tunings)))}",
-            "both of one, which a kill while they were written may have prevented",
-            "tuning again, or naming both files if this is meant",
+            "both of the same tuning (it may have been stopped while it wrote them)",
+            "tuning again, or naming both files if this is intended",
         )
 
 
 def _document(path: Path) -> dict[str, Any]:
-    """A file of parameters of a version that is known."""
+    """Read a file of parameters and check its version."""
     try:
         document = tomllib.loads(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise RecordingError(path, "no such file", "a noise.toml", "another path") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecordingError(
-            path, f"text that is not TOML ({error})", "TOML", "mending it"
+            path, f"text that is not TOML ({error})", "TOML", "correcting it"
         ) from error
     if document.get("schema_version") != SCHEMA_VERSION:
         raise RecordingError(
@@ -182,8 +214,10 @@ def _document(path: Path) -> dict[str, Any]:
     return document
 
 
-def _filled(path: Path, document: dict[str, Any], model: Model, params: Parameters) -> Parameters:
-    """The parameters with what a document says instead."""
+def _with_document(
+    path: Path, document: dict[str, Any], model: Model, params: Parameters
+) -> Parameters:
+    """The parameters with the values of a document in place of theirs."""
     if document.get("model") != model.name:
         raise ModelError(
             f"{path}: got parameters of the model '{document.get('model')}', expected those of"
@@ -200,14 +234,16 @@ def _filled(path: Path, document: dict[str, Any], model: Model, params: Paramete
     for section in _SECTIONS:
         if section in document:
             units = getattr(model.units, section)
-            values = _fill(path, section, getattr(params, section), units, document[section])
+            values = _with_entries(
+                path, section, getattr(params, section), units, document[section]
+            )
             params = params._replace(**{section: values})
     check(params, str(path))
     return params
 
 
 def check(params: Parameters, place: str = "parameters") -> None:
-    """Raise `ModelError` for a noise or initial deviation that is not positive and finite."""
+    """Raise `ModelError` for a noise or initial standard deviation that is not positive and finite."""
     for section in ("noise", "initial"):
         tree = getattr(params, section)
         for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True):
@@ -216,11 +252,11 @@ def check(params: Parameters, place: str = "parameters") -> None:
             if not (np.all(np.isfinite(value)) and np.all(deviations > 0.0)):
                 raise ModelError(
                     f"{place}: got {section}.{name} = {value.tolist()}, expected positive standard"
-                    " deviations; try a small positive number for what is nearly exact"
+                    " deviations; use a small positive number for a nearly exact value"
                 )
 
 
-def _fill(path: Path, section: str, default: Any, units: Any, entries: Any) -> Any:
+def _with_entries(path: Path, section: str, default: Any, units: Any, entries: Any) -> Any:
     names = leaf_names(default)
     if not isinstance(entries, dict):
         raise RecordingError(path, f"{section} = {entries!r}", "a section", f"[{section}.NAME]")
@@ -239,7 +275,7 @@ def _fill(path: Path, section: str, default: Any, units: Any, entries: Any) -> A
 
 
 def _value(path: Path, name: str, entry: Any, unit: str, shape: tuple[int, ...]) -> Any:
-    """One leaf: noise may be given for all axes, each or as a factor; calibration keeps its shape."""
+    """The value of one leaf: noise as one number, one for each axis or a factor; calibration as it is."""
     if not isinstance(entry, dict) or "value" not in entry:
         raise RecordingError(
             path,

@@ -1,9 +1,9 @@
-"""Asynchronous streams merged to one sequence of steps, with exact times.
+"""Asynchronous streams merged into one sequence of steps, with exact times.
 
-The steps come in *epochs* of a fixed number of substeps. A fast sensor may be sampled at every
-substep; a slow one (a tracker beside a gyroscope) only at the last of its epoch, so that its update
-is not paid for at every fast step. Epochs that are not full are padded **in front** by substeps of
-``dt = 0``, which change nothing. A sample that is missing is a mask, never a held value.
+The steps form *epochs* of a fixed number of substeps. A fast sensor may have a sample at every substep, a
+slow one (a tracker beside a gyroscope) only at the last substep of an epoch, so that its update is not
+computed at every fast step. Epochs that are not full are padded **in front** with substeps of ``dt = 0``,
+which have no effect. A missing sample is masked, never held.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import ModelError, RecordingError
-from jaxekf.estimation.output_times import Requested, within
+from jaxekf.estimation.output_times import OutputTimes, select_output_times
 from jaxekf.filtering.model import Model, Sensor, Start
 from jaxekf.filtering.steps import Knots, Rows, Steps
 from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S, longest_ns
@@ -30,15 +30,15 @@ from jaxekf.recordings.sample_selection import (
 )
 from jaxekf.recordings.types import NANOSECONDS, Recording, Samples, Times, period_ns
 
-_UPDATE_COST = 3.0  # of one slow update, in predictions; it only weighs the choice of epoch length
+_UPDATE_COST = 3.0  # of one slow update, in predictions; used only to choose the length of epochs
 _LONGEST_EPOCH = 32
 _EXTRAPOLATED_S = 0.5
-"""A time without any sample from which on a user is told."""
+"""A note names longer intervals without any sample."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The steps of one run, and what the host must remember about them."""
+    """The steps of one run, with the data that stays on the host."""
 
     name: str
     steps: Steps
@@ -47,17 +47,17 @@ class Timeline:
     first: dict[str, Any]
     """First visible sample of each sensor."""
     account: dict[str, dict[str, int]] = field(default_factory=dict)
-    """For each stream: rows read, fed to the filter, masked, and dropped by reason."""
+    """For each stream the number of rows read, passed to the filter (``fed``), masked and dropped."""
     notes: tuple[str, ...] = ()
-    """What a user should know of how the run was read."""
+    """Notes for the user, such as the part of the run that is extrapolated."""
     setup: Any = ()
     """`Parameters.setup` of this run."""
     latency_ns: dict[str, int] = field(default_factory=dict)
-    """How late each sensor's samples were known."""
+    """Latency of each sensor: from the time a sample is taken to the time it is known."""
     requested_ns: Times | None = None
-    """Instants that were asked for, each of them one of `time_ns`."""
+    """(N,) requested output times, a subset of `time_ns`; None without a request."""
     measured_ns: Times | None = None
-    """Where some were asked for, the instants that there would be without."""
+    """(M,) instants of the measurements, if there are output times; None without a request."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -69,23 +69,42 @@ def build(
     model: Model,
     recording: Recording,
     slow: tuple[str, ...] | None = None,
-    at: Requested | None = None,
+    at: OutputTimes | None = None,
 ) -> Timeline:
     """The timeline of one recording for one model.
 
-    `slow` names the sensors that are sampled at the end of epochs only; None finds them. `at` adds
-    instants at which nothing is measured; of times, those outside the run are left out, with a note.
+    Parameters
+    ----------
+    model
+        The model; it chooses streams and start.
+    recording
+        The run.
+    slow
+        Names of the sensors that are sampled only at the ends of epochs; None chooses them by their rates.
+    at
+        Output times, (N,) int64 nanoseconds or a grid, added as instants without samples. Times outside
+        the run are left out, with a note.
 
-    Raises `RecordingError` where streams are missing or do not overlap, where a sensor that the
-    model must start with is never seen, or where all of `at` lies outside the run; `ModelError` for `at`
-    of a model whose steps are those of one stream (`Model.hold_to`).
+    Returns
+    -------
+    Timeline
+        Steps with leading axes (K, S): epochs and substeps.
+
+    Raises
+    ------
+    RecordingError
+        A stream is missing, streams do not overlap, the model cannot start, or no output time is within
+        the run.
+    ModelError
+        A sensor has no source, or `at` is given for a model whose steps are the samples of one stream
+        (`Model.hold_to`).
     """
     samples = {s.name: _read(s, recording) for s in model.sensors}
     driver, counted = None, dict(samples)
     if model.input is not None:
         counted[model.input.name] = model.input.source(recording)
         driver = _check_input(counted[model.input.name], recording, model.input.name)
-    start, end, found = _span(model, recording, samples, driver)
+    start, end, start_sample = _run_interval(model, recording, samples, driver)
     account = {
         name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
         for name, stream in counted.items()
@@ -95,8 +114,8 @@ def build(
         if len(stream.time_ns) == 0:
             raise RecordingError(
                 recording.path or recording.name,
-                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, where"
-                f" the run of model '{model.name}' lies",
+                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, the"
+                f" interval that model '{model.name}' estimates",
                 "at least one",
                 "streams that overlap, or a model without that sensor",
             )
@@ -106,61 +125,93 @@ def build(
     if driver is not None:
         inside = (driver.time_ns >= start) & (driver.time_ns <= end)
         events.append(driver.time_ns[inside])
-    notes = (found.note,) if found is not None and found.note else ()
+    notes = (start_sample.note,) if start_sample is not None and start_sample.note else ()
     if part := recording.info.get("part"):
         notes = (f"part {part}", *notes)
     if driver is None and model.hold_to is None:
-        notes += _long_silence(samples, start)
-    asked = measured = None
+        notes += _extrapolation_notes(samples, start)
+    requested = measured = None
     if at is not None and model.hold_to is not None:
         raise ModelError(
             f"model '{model.name}' got times to estimate at, expected none because its steps are the"
-            f" samples of {model.hold_to}, and others would change it; take a model that holds nothing"
+            f" samples of {model.hold_to}, and more steps would change it; use another model, such as loose"
         )
     if at is not None:
-        asked, note = within(at, start, end, recording.path or recording.name)
+        requested, note = select_output_times(at, start, end, recording.path or recording.name)
         measured = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
-        events.append(asked)
+        events.append(requested)
         notes += (note,) if note else ()
     times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
     if slow is None:
         slow = _slow_sensors(samples, times)
     index = _epochs(times, [samples[name].time_ns for name in slow])
-    steps, step_times = _lay_out(times, index, samples, slow, start)
+    steps, step_times = _arrange(times, index, samples, slow, start)
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
-    if found is None:
-        found = Start(start, {name: first_visible(stream) for name, stream in samples.items()})
+    if start_sample is None:
+        start_sample = Start(
+            start, {name: first_visible(stream) for name, stream in samples.items()}
+        )
     latency = {name: stream.latency_ns for name, stream in samples.items()}
     setup = model.parameters.setup if model.setup is None else model.setup(recording)
     return Timeline(
         recording.name,
         steps,
         step_times,
-        found.first,
+        start_sample.first,
         account,
         notes,
         setup,
         latency,
-        asked,
+        requested,
         measured,
     )
 
 
 def build_many(
-    model: Model, recordings: Sequence[Recording], at: Sequence[Requested | None] | None = None
+    model: Model, recordings: Sequence[Recording], at: Sequence[OutputTimes | None] | None = None
 ) -> list[Timeline]:
-    """Timelines of several recordings, laid out alike so that they can be stacked; `at` for each."""
+    """Timelines of several recordings, with the same slow sensors so that they can be stacked.
+
+    Parameters
+    ----------
+    model, recordings
+        As in `build`.
+    at
+        Output times of each recording, None for one without.
+
+    Returns
+    -------
+    list of Timeline
+        In the order of `recordings`.
+
+    Raises
+    ------
+    RecordingError, ModelError
+        As in `build`.
+    """
     timelines: list[Timeline] = []
     at = [None] * len(recordings) if at is None else at
-    for recording, asked in zip(recordings, at, strict=True):
+    for recording, requested in zip(recordings, at, strict=True):
         slow = tuple(timelines[0].steps.slow) if timelines else None
-        timelines.append(build(model, recording, slow, asked))
+        timelines.append(build(model, recording, slow, requested))
     return timelines
 
 
 def from_steps(name: str, steps: Steps, first: dict[str, Any], start_ns: int = 0) -> Timeline:
-    """A timeline from arrays that never were a recording, such as simulated ones."""
+    """A timeline from arrays instead of a recording.
+
+    Parameters
+    ----------
+    name
+        Name of the run.
+    steps
+        Steps with leading axes (K, S); ``time`` in seconds since `start_ns`.
+    first
+        First visible sample of each sensor, for the initial state.
+    start_ns
+        Time of the start, int64 nanoseconds.
+    """
     time_ns = start_ns + np.round(np.asarray(steps.time) * NANOSECONDS).astype(np.int64)
     return Timeline(name, steps, time_ns, first)
 
@@ -180,10 +231,9 @@ def _read(sensor: Sensor, recording: Recording) -> Samples:
 
 
 def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
-    """Auxiliary data, what is not finite in hidden samples replaced by a known value.
+    """Auxiliary data, with a finite value in place of NaN in masked samples.
 
-    It passes through the model's own functions, whose gradient a NaN would reach even where the row
-    is masked.
+    The model's functions are evaluated at masked samples too, where a NaN would spoil the gradient.
     """
     values = np.array(values)
     known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
@@ -201,7 +251,7 @@ def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recor
 
 
 def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
-    """The input's valid samples; an input cannot be masked, so that a long gap in it is an error."""
+    """The valid samples of the input. It cannot be masked, so that a long gap is an error."""
     driver = take(driver, np.asarray(driver.mask))
     place = recording.path or recording.name
     count = len(driver.time_ns)
@@ -222,8 +272,8 @@ def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
     return driver
 
 
-def _long_silence(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
-    """A sentence where for long no sensor saw anything."""
+def _extrapolation_notes(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
+    """A note on long intervals without a sample of any sensor."""
     seen = [stream.time_ns[visible(stream)] for stream in samples.values()]
     times = np.unique(np.concatenate(seen))
     steps = np.diff(times) / NANOSECONDS
@@ -232,7 +282,7 @@ def _long_silence(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
         return ()
     at = ", ".join(f"{(times[i] - start) / NANOSECONDS:.3f}" for i in long[:5])
     return (
-        f"from {at} s{' and later' if long.size > 5 else ''} on no sensor saw anything for up to"
+        f"at {at} s{' and later' if long.size > 5 else ''} there is no sample of any sensor for up to"
         f" {steps[long].max():.3f} s: there the estimate is extrapolated",
     )
 
@@ -241,10 +291,13 @@ def _describe(times: Times) -> str:
     return f"{times[0] / NANOSECONDS:.6f} to {times[-1] / NANOSECONDS:.6f} s"
 
 
-def _span(
+def _run_interval(
     model: Model, recording: Recording, samples: dict[str, Samples], driver: Samples | None
 ) -> tuple[int, int, Start | None]:
-    """First and last time of the run: from the first usable samples to where the input ends."""
+    """First and last time of the run, and the start that the model found.
+
+    The run begins with the first usable samples and ends with the input or the last sample.
+    """
     place = recording.path or recording.name
     start = min(int(s.time_ns[0]) for s in samples.values())
     end = max(int(s.time_ns[-1]) for s in samples.values())
@@ -275,15 +328,15 @@ def _span(
     if model.find_start is None:
         return start, end, None
     inside = {name: cut(stream, start, end) for name, stream in samples.items()}
-    found = model.find_start(recording, inside)
-    if found is None:
+    start_sample = model.find_start(recording, inside)
+    if start_sample is None:
         raise RecordingError(
             place,
             f"no instant at which '{model.name}' can start",
             "at least one (see the model)",
             "a run in which enough is seen at once: markers of the tool, or landmarks in an image",
         )
-    return found.time_ns, end, found
+    return start_sample.time_ns, end, start_sample
 
 
 def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
@@ -300,12 +353,12 @@ def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
 
 
 def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:
-    """Sensors sampled at no more than half of the instants."""
+    """Sensors with samples at no more than half of the instants."""
     return tuple(name for name, s in samples.items() if 2 * len(s.time_ns) <= len(times) + 1)
 
 
 def _epochs(times: Times, slow_times: list[Times]) -> NDArray[np.intp]:
-    """Index of the instant of each substep, (K, S), -1 in padding; slow samples fall on the last."""
+    """Index (K, S) into `times` of each substep, -1 in padding; slow samples are at the last substep."""
     if not slow_times:
         return np.arange(len(times))[:, None]
     ends = np.flatnonzero(np.isin(times, np.concatenate(slow_times)))
@@ -325,7 +378,7 @@ def _epochs(times: Times, slow_times: list[Times]) -> NDArray[np.intp]:
     return index
 
 
-def _lay_out(
+def _arrange(
     times: Times,
     index: NDArray[np.intp],
     samples: dict[str, Samples],
@@ -333,7 +386,7 @@ def _lay_out(
     start: int,
 ) -> tuple[Steps, Times]:
     valid = index >= 0
-    # A padded substep carries the instant of the valid one before it (the start, if there is none).
+    # A padded substep has the time of the valid one before it, or that of the start.
     flat = np.maximum.accumulate(index.reshape(-1)).reshape(index.shape)
     step_times = np.where(flat >= 0, times[np.maximum(flat, 0)], start)
     dt_ns = np.diff(step_times.reshape(-1), prepend=start).reshape(index.shape)
@@ -345,20 +398,20 @@ def _lay_out(
     return steps, step_times
 
 
-def _rows(samples: Samples, asked: Times) -> Rows:
-    """The samples at the asked times; masked where there is none."""
-    at = np.clip(np.searchsorted(samples.time_ns, asked), 0, len(samples.time_ns) - 1)
-    here = samples.time_ns[at] == asked
+def _rows(samples: Samples, times: Times) -> Rows:
+    """The samples at these times, masked at times without one."""
+    at = np.clip(np.searchsorted(samples.time_ns, times), 0, len(samples.time_ns) - 1)
+    here = samples.time_ns[at] == times
     nominal = period_ns(samples.time_ns)
     since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal)
-    # After a dropout a sample has not averaged over the gap: its own period is the nominal one.
+    # A sample after a gap is not an average over the gap: its period is the nominal one.
     since = np.minimum(since, nominal) / NANOSECONDS
     taken = take(samples, at)
     return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
 
 
 def knots_from(time_ns: Times, value: Any, start: int) -> Knots:
-    """The knots of an input sampled at these times, in seconds since `start`."""
+    """Knots of an input with samples `value` (N, C) at `time_ns` (N,), in seconds since `start` (ns)."""
     time = (time_ns - start) / NANOSECONDS
     value = np.asarray(value, float)
     steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]

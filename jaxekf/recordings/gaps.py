@@ -22,11 +22,23 @@ def longest_ns(time_ns: Times) -> float:
 
 
 def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording]]:
-    """The run itself, or its parts between gaps of the IMU longer than 0.1 s (or three periods).
+    """Split a run at the gaps of its IMU that are longer than 0.1 s and than three periods.
 
-    Returns what can be estimated and, second, what cannot: parts shorter than half a second, or in which
-    tracker and camera see nothing. Every row of the source belongs to one part: their samples in a gap to
-    the part before it. Parts are named ``NAME-part1`` and so on; what cut them is in ``info["part"]``.
+    Every row of the recording belongs to one part; rows of other streams within a gap belong to the part
+    before it.
+
+    Parameters
+    ----------
+    recording
+        The run.
+
+    Returns
+    -------
+    list of Recording
+        The parts that can be estimated, named ``NAME-part1`` and so on, with the gaps in ``info["part"]``;
+        the run itself if it has no gap or no IMU.
+    list of Recording
+        The parts that cannot be estimated: shorter than 0.5 s, or without a sample of tracker or camera.
     """
     if recording.imu is None:
         return [recording], []

@@ -1,22 +1,18 @@
-"""Pictures of an estimate beside what was measured and what is true.
+"""Figures of an estimate, with the measurements and the truth of its recording.
 
-Every figure is a function of an estimate and its recording; `possible_figures` tells which of them a model
-and a recording can show.
+A figure is a function of an estimate and its recording, in a private module of this package. Its decorator
+`_registry.figure` states which data it needs and registers it under its own name. Modules whose names
+begin with ``_`` are found without being listed. A new figure is one file, or one function, and its test.
 """
 
-from collections.abc import Callable
-
-from matplotlib.figure import Figure
+from importlib import import_module
+from pkgutil import iter_modules
 
 from jaxekf.estimation.result import Estimate
-from jaxekf.geometry import manifold
 from jaxekf.recordings.types import Recording
-from jaxekf.reporting.plots._attitudes import attitude, euler_sigma_deg, occlusion
-from jaxekf.reporting.plots._biases import bias
-from jaxekf.reporting.plots._paths import path
-from jaxekf.reporting.plots._sight import longest_gap, look
-from jaxekf.reporting.plots._single_markers import innovations, marker_sensors, visibility
-from jaxekf.reporting.plots._vectors import position, rate, velocity
+from jaxekf.reporting.plots._attitudes import euler_sigma_deg
+from jaxekf.reporting.plots._measurements import longest_gap
+from jaxekf.reporting.plots._registry import FIGURES, Draw
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, STYLE, TRUTH, band, save
 
 __all__ = [
@@ -24,49 +20,41 @@ __all__ = [
     "MEASURED",
     "STYLE",
     "TRUTH",
+    "available_figures",
     "band",
     "euler_sigma_deg",
     "figure_functions",
     "longest_gap",
-    "possible_figures",
     "save",
 ]
 
-_LEAST_INSTANTS = 10
+_FEWEST_INSTANTS = 10
+
+for _module in iter_modules(__path__):
+    if _module.name.startswith("_"):
+        import_module(f"{__name__}.{_module.name}")
 
 
-def figure_functions() -> dict[str, Callable[[Estimate, Recording], Figure]]:
-    """Every figure by its file name."""
-    return {
-        "attitude": attitude,
-        "position": position,
-        "velocity": velocity,
-        "rate": rate,
-        "bias": bias,
-        "occlusion": occlusion,
-        "path": path,
-        "visibility": visibility,
-        "innovations": innovations,
-    }
+def figure_functions() -> dict[str, Draw]:
+    """The functions that draw the figures, by name, in alphabetical order."""
+    return {name: FIGURES[name].draw for name in sorted(FIGURES)}
 
 
-def possible_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...]:
-    """Names of the figures that this model and recording can show; none of fewer than ten instants."""
-    if len(estimate.time_ns) < _LEAST_INSTANTS:
+def available_figures(estimate: Estimate, recording: Recording) -> tuple[str, ...]:
+    """Names of the figures that an estimate and its recording have the data for.
+
+    Parameters
+    ----------
+    estimate
+        The estimate of one run. With fewer than ten instants it has no figure.
+    recording
+        The recording that was estimated.
+
+    Returns
+    -------
+    tuple of str
+        Names in `figure_functions`, in alphabetical order.
+    """
+    if len(estimate.time_ns) < _FEWEST_INSTANTS:
         return ()
-    tracked = look(estimate, recording).t.size > 0
-    parts = {part.name for part in manifold.parts(estimate.model.space)}
-    single = bool(marker_sensors(estimate, recording))
-    needs = {
-        "attitude": "attitude" in estimate.outputs,
-        "position": "position" in estimate.outputs,
-        "velocity": "velocity" in estimate.outputs,
-        "rate": "rate" in estimate.outputs and recording.imu is not None,
-        "bias": "bias" in parts and recording.imu is not None,
-        "occlusion": tracked and "attitude" in estimate.outputs,
-        "path": "position" in estimate.outputs
-        or ("attitude" in estimate.outputs and "marker_body" in recording.info),
-        "visibility": single,
-        "innovations": single,
-    }
-    return tuple(name for name in figure_functions() if needs[name])
+    return tuple(name for name in sorted(FIGURES) if FIGURES[name].applies(estimate, recording))

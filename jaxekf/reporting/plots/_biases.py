@@ -1,4 +1,4 @@
-"""Biases of the gyroscope and, where the model has it, of the accelerometer."""
+"""Biases of the gyroscope and, if the model has it, of the accelerometer."""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +9,8 @@ from jaxekf.estimation.result import Estimate, Estimated
 from jaxekf.geometry import manifold
 from jaxekf.recordings.truth import encoder_rate_at
 from jaxekf.recordings.types import Floats, Recording
-from jaxekf.reporting.plots._sight import look, seconds, shade
+from jaxekf.reporting.plots._measurements import pose_measurements, seconds, shade
+from jaxekf.reporting.plots._registry import figure
 from jaxekf.reporting.plots.style import (
     AXES,
     ESTIMATE,
@@ -22,45 +23,52 @@ from jaxekf.reporting.plots.style import (
 )
 
 
-class Told(NamedTuple):
-    """What the encoder says the gyroscope's bias was, deg/s."""
+class EncoderBias(NamedTuple):
+    """The gyroscope's bias by comparison with the encoder, deg/s."""
 
     t: Floats
+    """(M,) seconds since the estimate's first instant."""
     difference: Floats
-    """(M, 3) gyroscope less encoder."""
+    """(M, 3) rate of the gyroscope minus rate of the encoder."""
     at_rest: Floats | None
-    """(3,)."""
+    """(3,) mean difference at rest before the motion; None for a rest of less than a second."""
 
 
+def _has_bias(estimate: Estimate, recording: Recording) -> bool:
+    parts = {part.name for part in manifold.parts(estimate.model.space)}
+    return "bias" in parts and recording.imu is not None
+
+
+@figure(_has_bias)
 def bias(estimate: Estimate, recording: Recording) -> Figure:
-    """Gyroscope bias with its 2 sigma band, and what the encoder says it was; on the right that of the
-    accelerometer, of which an encoder tells nothing."""
-    sight, known = look(estimate, recording), told(estimate, recording)
+    """Gyroscope bias with its 2 sigma band and its value by the encoder; on the right the accelerometer
+    bias, which an encoder does not measure."""
+    poses, known = pose_measurements(estimate, recording), encoder_bias(estimate, recording)
     has_force = "accelerometer_bias" in {p.name for p in manifold.parts(estimate.model.space)}
     with styled():
         size = (11, 6.5) if has_force else (9, 6.5)
-        figure, grid = new_grid(3, 2 if has_force else 1, size, sharex=True)
-        turning = estimate.bias
+        drawn, grid = new_grid(3, 2 if has_force else 1, size, sharex=True)
+        gyroscope = estimate.bias
         for i, axis in enumerate(AXES):
             axes = grid[i, 0]
-            shade(axes, sight)
+            shade(axes, poses)
             if known is not None:
-                _draw_told(axes, known, i)
-            value, sigma = np.rad2deg(turning.value[:, i]), np.rad2deg(turning.sigma[:, i])
+                _draw_encoder_bias(axes, known, i)
+            value, sigma = np.rad2deg(gyroscope.value[:, i]), np.rad2deg(gyroscope.sigma[:, i])
             _draw(axes, estimate.time, value, sigma)
-            axes.set_ylabel(f"gyroscope about {axis} (deg/s)")
+            axes.set_ylabel(f"gyroscope bias {axis} (deg/s)")
             if has_force:
                 axes, force = grid[i, 1], estimate.part("accelerometer_bias")
-                shade(axes, sight)
+                shade(axes, poses)
                 _draw(axes, estimate.time, force.value[:, i], force.sigma[:, i])
-                axes.set_ylabel(f"accelerometer along {axis} (m/s²)")
-        named = "biases of the gyroscope and the accelerometer" if has_force else "gyroscope bias"
-        finish(figure, grid, f"{estimate.run}: {named}")
-    return figure
+                axes.set_ylabel(f"accelerometer bias {axis} (m/s²)")
+        title = "gyroscope and accelerometer bias" if has_force else "gyroscope bias"
+        finish(drawn, grid, f"{estimate.run}: {title}, body frame")
+    return drawn
 
 
-def told(estimate: Estimated, recording: Recording) -> Told | None:
-    """What the encoder says; None without one."""
+def encoder_bias(estimate: Estimated, recording: Recording) -> EncoderBias | None:
+    """The gyroscope's bias by comparison with the encoder; None for a recording without encoder."""
     if recording.encoder is None:
         return None
     imu = recording.need_imu()
@@ -68,18 +76,18 @@ def told(estimate: Estimated, recording: Recording) -> Told | None:
     t = seconds(imu.time_ns[inside], estimate)
     true_rate = encoder_rate_at(recording.encoder, imu.time_ns[inside])
     difference = np.rad2deg(imu.gyroscope[inside] - true_rate)
-    return Told(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))
+    return EncoderBias(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))
 
 
-def _draw_told(axes: Any, told: Told, i: int) -> None:
-    mean = running_mean(told.t, told.difference[:, i], 2.0)
+def _draw_encoder_bias(axes: Any, known: EncoderBias, i: int) -> None:
+    mean = running_mean(known.t, known.difference[:, i], 2.0)
     axes.plot(*mean, color=MEASURED, lw=1, label="gyroscope − encoder, 2 s mean")
-    if told.at_rest is not None:
-        axes.axhline(told.at_rest[i], color=TRUTH, lw=1.2, ls="--", label="measured at rest")
+    if known.at_rest is not None:
+        axes.axhline(known.at_rest[i], color=TRUTH, lw=1.2, ls="--", label="mean at rest")
 
 
 def _draw(axes: Any, t: Floats, value: Floats, sigma: Floats) -> None:
-    """A bias with its band, in a range that the wide band of the start does not rule."""
+    """A bias with its band. The wide band at the start does not determine the limits."""
     axes.plot(t, value, color=ESTIMATE, lw=1.2, label="estimate")
     band(axes, t, value, sigma, "2σ of the estimate")
     settled = t >= min(2.0, 0.1 * t[-1])
@@ -89,7 +97,7 @@ def _draw(axes: Any, t: Floats, value: Floats, sigma: Floats) -> None:
 
 
 def running_mean(t: Floats, values: Floats, seconds: float) -> tuple[Floats, Floats]:
-    """Mean over a window, without the half windows at the ends and without unknown samples."""
+    """Moving average over a window of `seconds`, without the half windows at the ends; NaN is left out."""
     known = np.isfinite(values)
     t, values = t[known], values[known]
     width = round(seconds / max(float(np.median(np.diff(t))), 1e-9)) if len(t) > 1 else 0
@@ -100,7 +108,7 @@ def running_mean(t: Floats, values: Floats, seconds: float) -> tuple[Floats, Flo
 
 
 def _rest_value(t: Floats, true_rate_deg: Floats, difference: Floats) -> Floats | None:
-    """Mean of the gyroscope while the encoder stands still at the start; None within the first second."""
+    """Mean difference (3,) while the encoder rests at the start; None for less than a second."""
     known = np.asarray(np.isfinite(difference).all(axis=1))
     moving = np.flatnonzero(known & (np.abs(true_rate_deg) > 0.05).any(axis=1))
     end = moving[0] if moving.size else len(t)

@@ -1,4 +1,4 @@
-"""Allan deviation of the sensors of a run at rest, with what it is made of."""
+"""Allan deviation of the sensors of a static recording, with the fitted noise model."""
 
 from typing import Any
 
@@ -13,11 +13,13 @@ from jaxekf.reporting.plots.style import AXES, ESTIMATE, MEASURED, TRUTH, new_gr
 _COLOURS = (ESTIMATE, MEASURED, "#6aa84f")
 
 
-def allan(found: StaticNoise) -> Figure:
-    """Deviation over averaging time on logarithmic axes, one panel a sensor, each axis with its 95 % band
-    and the sum of the noise fitted to it, as far as that was used; the slopes of white noise and random
-    walk beside."""
-    sensors = found.sensors
+def allan(noise: StaticNoise) -> Figure:
+    """Allan deviation over averaging time on logarithmic axes, one panel for each sensor.
+
+    Each axis has its 95 % confidence band and the fitted noise model, over the averaging times of the fit.
+    Dotted and dashed lines are the slopes of white noise and of a random walk.
+    """
+    sensors = noise.sensors
     with styled():
         figure, grid = new_grid(1, len(sensors), (5.6 * len(sensors) + 0.4, 5.2))
         for axes, (label, sensor) in zip(grid[0], sensors.items(), strict=True):
@@ -27,8 +29,10 @@ def allan(found: StaticNoise) -> Figure:
             axes.set_ylabel(f"Allan deviation of the {label} ({unit})")
             axes.set_xlabel("averaging time τ (s)")
         handles, names = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        figure.suptitle(f"{found.run}: {found.imu.duration_s:.1f} s at rest")
+        # In two rows under a single panel.
+        columns = min(len(names), 3 * len(sensors))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns)
+        figure.suptitle(f"{noise.run}: Allan deviation of {noise.imu.duration_s:.1f} s at rest")
     return figure
 
 
@@ -44,17 +48,21 @@ def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
             lw=0,
         )
         axes.plot(
-            curve.tau, turn * curve.deviation[:, i], "o", color=colour, ms=3, label=f"{axis}, 95 %"
+            curve.tau,
+            turn * curve.deviation[:, i],
+            "o",
+            color=colour,
+            ms=3,
+            label=f"{axis}, 95 % band",
         )
-    for made, colour in zip(sensor.axes, _COLOURS, strict=True):
-        # Nothing was fitted to what averages less than a period of the highest frequency used.
-        tau = curve.tau[curve.tau >= 0.9 * min(0.5 / made.band_hz, curve.tau[-1])]
+    for noise, colour in zip(sensor.axes, _COLOURS, strict=True):
+        # Averaging times below a period of the highest frequency used are not part of the fit.
+        tau = curve.tau[curve.tau >= 0.9 * min(0.5 / noise.band_hz, curve.tau[-1])]
         label = "fit" if colour == _COLOURS[0] else None
-        axes.plot(tau, turn * made.deviation(tau), color=colour, lw=1, label=label)
+        axes.plot(tau, turn * noise.deviation(tau), color=colour, lw=1, label=label)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    # The bands, and not the slopes, are to fill the panel; never less than a decade, so that the scale can
-    # be read.
+    # The bands, not the slopes, determine the limits; at least a decade, so that the scale has labels.
     low, high = (
         turn * float(f(getattr(curve, part))) for f, part in ((np.min, "low"), (np.max, "high"))
     )
@@ -72,7 +80,7 @@ def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
 
 
 def _slopes(axes: Any, sensor: SensorNoise, turn: float) -> None:
-    """What white noise alone and a random walk alone would give, on the mean of the axes."""
+    """Allan deviations of white noise alone and of a random walk alone, mean of the axes."""
     tau = np.array(axes.get_xlim())
     white = turn * float(np.mean(sensor.white))
     axes.plot(tau, white / np.sqrt(tau), ":", color=TRUTH, lw=1, label="white noise, ∝ 1/√τ")

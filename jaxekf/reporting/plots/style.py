@@ -1,4 +1,4 @@
-"""What all figures share: colours, bands, legends and files. The only user of matplotlib's settings."""
+"""Colours, bands, legends and files of all figures. Only this module changes matplotlib's settings."""
 
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -29,7 +29,7 @@ STYLE: Any = {
 
 
 def styled() -> AbstractContextManager[None]:
-    """The settings, while a figure is drawn."""
+    """A context in which matplotlib has the settings of `STYLE`."""
     return mpl.rc_context(STYLE)
 
 
@@ -49,14 +49,14 @@ def new_grid(
 
 
 def band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None) -> None:
-    """Two standard deviations about a curve."""
+    """Fill two standard deviations above and below a curve."""
     axes.fill_between(
         t, centre - 2 * sigma, centre + 2 * sigma, color=ESTIMATE, alpha=0.22, lw=0, label=label
     )
 
 
 def symmetric_limits(axes: Any, values: Floats) -> None:
-    """A symmetric range that shows what matters and is not ruled by single outliers."""
+    """Set limits symmetric about zero that hold 99.5 % of the values."""
     values = values[np.isfinite(values)]
     if values.size:
         bound = 1.3 * np.quantile(np.abs(values), 0.995) + 1e-12
@@ -64,7 +64,7 @@ def symmetric_limits(axes: Any, values: Floats) -> None:
 
 
 def finish(figure: Figure, grid: Any, title: str) -> None:
-    """Time below every column, the title above, and one legend of all curves at the foot."""
+    """Add time labels below the columns, the title, and one legend of all curves at the bottom."""
     for axes in grid[-1]:
         axes.set_xlabel("time since the start of the estimate (s)")
     named: dict[str, Any] = {}
@@ -80,11 +80,11 @@ def finish(figure: Figure, grid: Any, title: str) -> None:
 
 
 def save(figure: Figure, file: Path | str) -> Path:
-    """Write a figure as PNG, whole or not at all; an earlier one is replaced."""
+    """Write a figure as a PNG file, atomically; an existing file is replaced."""
     canvas = FigureCanvasAgg(figure)
-    with styled(), whole_file(file, overwrite=True) as made:
+    with styled(), whole_file(file, overwrite=True) as temporary:
         figure.set_dpi(STYLE["savefig.dpi"])
-        # `savefig` lays out and draws twice, once to nowhere: half of the time of a figure.
+        # `savefig` would lay out and draw twice, which doubles the time.
         canvas.draw()
-        imsave(made, canvas.buffer_rgba(), format="png", dpi=figure.dpi)
+        imsave(temporary, canvas.buffer_rgba(), format="png", dpi=figure.dpi)
     return Path(file)

@@ -1,4 +1,4 @@
-"""The time axis of a recording: when each stream has samples, gaps and rows that were masked."""
+"""Samples, gaps and masked rows of the streams of a recording over time."""
 
 from typing import Any
 
@@ -13,14 +13,17 @@ from jaxekf.reporting.plots.style import ESTIMATE, REFUSED, new_figure, styled
 _BINS = 400
 _HEIGHT = 0.72
 _LEAST_WIDTH = 1 / 600
-"""Of the axis: a shorter gap could not be seen."""
+"""Least width of a bar, as a fraction of the axis, so that short gaps are visible."""
 _GAP = "#f4cccc"
 _COLOURS = ("#e69138", "#8e7cc3", "#6aa84f", "#bf9000", "#a64d79", "#45818e", "#7f6000", "#999999")
 
 
 def time_axis(recording: Recording, found: Inspection) -> Figure:
-    """A lane for each stream, or marker: the rate of its samples as bars up to the nominal one, gaps, and
-    what was masked by reason, over seconds since the first sample of all."""
+    """One lane for each stream or marker, over seconds since the first sample of the recording.
+
+    A lane has the rate of its samples, relative to the nominal one, as bars; gaps; and masked samples, with
+    a colour for each reason.
+    """
     lanes = _lanes(recording, found)
     origin = min(int(lane[1][0]) for lane in lanes.values())
     last = max(int(lane[1][-1]) for lane in lanes.values())
@@ -29,12 +32,12 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
     with styled():
         figure = new_figure((11, 1.7 + 0.62 * len(lanes)))
         axes: Any = figure.subplots()
-        for line, (told, time_ns, masked) in enumerate(lanes.values()):
+        for line, (summary, time_ns, masked) in enumerate(lanes.values()):
             t = (time_ns - origin) / NANOSECONDS
-            _density(axes, line, t, told, masked)
+            _density(axes, line, t, summary, masked)
             least = _LEAST_WIDTH * span
             zero = origin / NANOSECONDS
-            bars = [_bar(a - zero, b - zero, least) for a, b in told.gaps.spans]
+            bars = [_bar(a - zero, b - zero, least) for a, b in summary.gaps.spans]
             axes.broken_barh(bars, _upper(line), color=_GAP, lw=0, zorder=2)
             edges = [(a, 0.0) for a, _ in bars] + [(a + w, 0.0) for a, w in bars]
             axes.broken_barh(edges, _upper(line), edgecolor=REFUSED, lw=0.4, zorder=3)
@@ -45,7 +48,7 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
             axes.text(
                 1.01,
                 line,
-                _words(told),
+                _summary_text(summary),
                 transform=axes.get_yaxis_transform(),
                 va="center",
                 fontsize=8,
@@ -56,9 +59,9 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
         axes.set_xlim(-0.005 * span, 1.005 * span)
         axes.grid(visible=False, axis="y")
         axes.set_axisbelow(True)
-        axes.set_xlabel(f"seconds since {origin / NANOSECONDS:.3f} s, latency taken off")
-        legend = [Patch(color=ESTIMATE, label="samples (full height: nominal rate)")]
-        if any(told.gaps.count for told, _, _ in lanes.values()):
+        axes.set_xlabel(f"time since {origin / NANOSECONDS:.3f} s, corrected for latency (s)")
+        legend = [Patch(color=ESTIMATE, label="sample rate (full height: nominal rate)")]
+        if any(summary.gaps.count for summary, _, _ in lanes.values()):
             legend.append(Patch(facecolor=_GAP, edgecolor=REFUSED, lw=0.4, label="gap: no rows"))
         legend += [Patch(color=colour, label=name) for name, colour in colours.items()]
         figure.legend(handles=legend, loc="outside lower center", ncols=min(4, len(legend)))
@@ -69,17 +72,17 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
 def _lanes(
     recording: Recording, found: Inspection
 ) -> dict[str, tuple[StreamSummary, Times, dict[str, Flags]]]:
-    """What was found, times and masked samples by reason, for each lane."""
+    """Summary, sample times and masked samples by reason, for each lane."""
     lanes = {}
     for label, stream in recording.streams.items():
         time_ns = stream.time_ns - stream.latency_ns
         if label == "markers":
-            for i, (name, told) in enumerate(found.markers.items()):
-                lost = {"hidden, or of too little quality": ~stream.usable[:, i]}
-                lanes[f"marker {name}"] = (told, time_ns, lost)
+            for i, (name, summary) in enumerate(found.markers.items()):
+                lost = {"hidden, or quality too low": ~stream.usable[:, i]}
+                lanes[f"marker {name}"] = (summary, time_ns, lost)
             continue
         if label == "camera":
-            # Many landmarks in few images: their rows are no samples, and a lane for each too many.
+            # The samples are the images: a lane for each landmark would be too many.
             empty = ~stream.usable.any(axis=1)
             masked = {"no landmark found": empty} if empty.any() else {}
         else:
@@ -89,36 +92,36 @@ def _lanes(
 
 
 def _masked(recording: Recording, label: str, stream: Any) -> dict[str, Flags]:
-    """Samples of a stream by the reason for which they are not used."""
+    """Flags of the unused samples of a stream, by reason."""
     bad = ~getattr(stream, "valid", np.ones(len(stream.time_ns), bool))
     account = recording.intake.get(label)
-    found: dict[str, Flags] = {}
+    by_reason: dict[str, Flags] = {}
     for name, reason in ({} if account is None else account.masked).items():
         flags = np.isin(stream.time_ns, reason.time_ns)
         if flags.any():
-            found[name] = flags
+            by_reason[name] = flags
             bad = bad & ~flags
     if bad.any():
-        found["not valid"] = bad
-    return found
+        by_reason["not valid"] = bad
+    return by_reason
 
 
 def _density(
-    axes: Any, line: int, t: Floats, told: StreamSummary, masked: dict[str, Flags]
+    axes: Any, line: int, t: Floats, summary: StreamSummary, masked: dict[str, Flags]
 ) -> None:
-    """Usable samples in each part of the lane's time, as a share of what the nominal rate would give."""
+    """Bars of the rate of usable samples, relative to the nominal rate."""
     good = np.ones(len(t), bool)
     for flags in masked.values():
         good &= ~flags
     span = float(t[-1] - t[0])
-    if not told.rate_hz > 0.0 or span <= 0.0:
+    if not summary.rate_hz > 0.0 or span <= 0.0:
         axes.plot(t[good], np.full(int(good.sum()), line), "|", color=ESTIMATE, ms=18)
         return
-    # A part holds some samples, so that whole numbers of them do not show as noise.
-    bins = int(np.clip(span * told.rate_hz / 20.0, 1, _BINS))
-    edges = np.linspace(t[0], t[-1] + 1.0 / told.rate_hz, bins + 1)
-    count, whole = np.histogram(t[good], edges)[0], np.diff(edges) * told.rate_hz
-    # Edges fall between samples or not: one less is none less.
+    # A bin holds about 20 samples, so that rounding to whole samples does not look like noise.
+    bins = int(np.clip(span * summary.rate_hz / 20.0, 1, _BINS))
+    edges = np.linspace(t[0], t[-1] + 1.0 / summary.rate_hz, bins + 1)
+    count, whole = np.histogram(t[good], edges)[0], np.diff(edges) * summary.rate_hz
+    # A bin may have one sample less because of where its edges are.
     top = _HEIGHT * np.where(count > whole - 1.5, 1.0, count / whole)
     foot = line + _HEIGHT / 2
     axes.stairs(foot - top, edges, baseline=foot, fill=True, color=ESTIMATE, lw=0, zorder=1)
@@ -129,7 +132,7 @@ def _upper(line: int) -> tuple[float, float]:
 
 
 def _bar(begin: float, end: float, least: float) -> tuple[float, float]:
-    """Begin and width, wide enough to be seen."""
+    """Begin and width of a bar, at least `least` wide."""
     width = max(end - begin, least)
     return 0.5 * (begin + end - width), width
 
@@ -140,10 +143,10 @@ def _stretches(t: Floats, chosen: Flags) -> list[tuple[float, float]]:
     return [(float(t[a]), float(t[b])) for a, b in zip(edges[::2], ends, strict=True)]
 
 
-def _words(told: StreamSummary) -> str:
-    lines = [f"{told.rate_hz:.4g} Hz" if told.rate_hz == told.rate_hz else "1 sample"]
-    if told.gaps.count:
-        lines.append(f"{told.gaps.count} gaps, {told.gaps.lost_s:.3g} s")
-    if told.usable < told.samples:
-        lines.append(f"{100.0 * (1.0 - told.usable / told.samples):.2g} % masked")
+def _summary_text(summary: StreamSummary) -> str:
+    lines = [f"{summary.rate_hz:.4g} Hz" if summary.rate_hz == summary.rate_hz else "1 sample"]
+    if summary.gaps.count:
+        lines.append(f"{summary.gaps.count} gaps, {summary.gaps.lost_s:.3g} s")
+    if summary.usable < summary.samples:
+        lines.append(f"{100.0 * (1.0 - summary.usable / summary.samples):.2g} % masked")
     return "\n".join(lines)

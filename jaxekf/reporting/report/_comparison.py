@@ -14,7 +14,7 @@ from jaxekf.evaluation.metrics import Score
 from jaxekf.io import run_folder
 from jaxekf.io.documents.result import ScoreNumbers
 from jaxekf.recordings.types import NANOSECONDS, Floats, Recording, period_ns
-from jaxekf.reporting.plots._sight import Sight, Stretch, look
+from jaxekf.reporting.plots._measurements import PoseMeasurements, Stretch, pose_measurements
 from jaxekf.reporting.report._saved import SavedResult
 
 _NAN = float("nan")
@@ -28,7 +28,7 @@ class ComparedResult(NamedTuple):
     recording: Recording | None
     missing: str
     """Why there is no recording; empty where there is one."""
-    sight: Sight | None
+    sight: PoseMeasurements | None
     gaps: list[Stretch]
     """Begin and end, in seconds, of the stretches without a pose of the tracker."""
     score: Score | None
@@ -50,7 +50,7 @@ def compare(result: SavedResult) -> ComparedResult:
     recording, missing = _load(result)
     sight = None
     if recording is not None:
-        sight = look(result, recording)
+        sight = pose_measurements(result, recording)
         sight = sight if sight.label else None
     gaps = _gaps(result) if sight is None else sight.lost
     score, held, raw, errors = None, _NAN, _NAN, {}

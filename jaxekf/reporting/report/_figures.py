@@ -10,8 +10,8 @@ from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocit
 from jaxekf.recordings.types import Floats
 from jaxekf.reporting import plots
 from jaxekf.reporting.plots._attitudes import euler_deg, same_turn
-from jaxekf.reporting.plots._biases import running_mean, told
-from jaxekf.reporting.plots._sight import seconds, truth
+from jaxekf.reporting.plots._biases import encoder_bias, running_mean
+from jaxekf.reporting.plots._measurements import seconds, truth
 from jaxekf.reporting.plots.style import AXES, MEASURED, TRUTH
 from jaxekf.reporting.report._comparison import ComparedResult
 from jaxekf.reporting.report._grid import Column, Grid, Place
@@ -193,7 +193,7 @@ def bias(compared: ComparedResult, bins: int) -> Figure | None:
     grid = Grid(columns, 3, row_height=_ROW, bins=bins)
     recording, known = compared.recording, None
     if recording is not None and recording.imu is not None:
-        known = told(compared.result, recording)
+        known = encoder_bias(compared.result, recording)
     shade(grid, compared)
     for i, axis in enumerate(AXES):
         at = Place(i)

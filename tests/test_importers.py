@@ -165,8 +165,8 @@ def test_ndi_a_line_for_each_tool(write):
 
 @pytest.mark.parametrize(("mark", "other"), [(".", ","), (",", ".")])
 def test_commas_in_names_are_no_decimal_marks(write, mark, other):
-    """Would catch a name that is cut at its comma, points in names that make decimal commas doubtful, a
-    mixture of marks that is guessed at, and blank cells with spaces that are no numbers."""
+    """Would catch a name cut at its comma, points in names that make decimal commas doubtful, a mixture of
+    marks that is guessed at, and blank cells with spaces that are no numbers."""
     head = "Frame;Time [s];Tool;Q0;Qx;Qy;Qz;Tx;Ty;Tz"
     row = "{i};1700000000{m}{i}23456789;Probe, v1.rom;0{m}8;0;0;0{m}6;{i}{m}5;0;0"
     lines = [head, *(row.format(i=i, m=mark) for i in range(1, 4))]

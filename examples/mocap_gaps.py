@@ -314,7 +314,7 @@ def main() -> None:
         if methods["estimate"]:
             summary[length] = {name: medians(errors) for name, errors in methods.items()}
             summary[length]["stretches"] = len(methods["estimate"])
-    print(f"{'hidden':>8}{'stretches':>11}  " + "".join(f"{name:>28}" for name in METHODS))
+    print(f"{'hidden':>8}{'intervals':>11}  " + "".join(f"{name:>28}" for name in METHODS))
     for length, row in summary.items():
         cells = "".join(f"{row[n]['mm']:>16.1f} mm{row[n]['deg']:>6.2f}°  " for n in METHODS)
         print(f"{length + ' s':>8}{row['stretches']:>11}  {cells}")
@@ -322,7 +322,7 @@ def main() -> None:
         print(f"{name}: {found}")
     checks = checks_of(summary, outlying)
     for length in table.keys() - summary.keys():
-        checks[f"a stretch of {length} s to hide"] = False
+        checks[f"an interval of {length} s to hide"] = False
     checks |= {f"{name}: can be estimated": False for name in failed}
     for text, passed in checks.items():
         print(f"{'ok    ' if passed else 'MISSED'} {text}")

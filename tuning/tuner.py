@@ -12,7 +12,8 @@ import optax
 
 from jaxekf._support.deprecations import renamed_arguments
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.batch import Run, provenance, read, require_float64
+from jaxekf.estimation.batch import Run, read, require_float64
+from jaxekf.estimation.versions import provenance
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.io.hashes import inputs_of
 from jaxekf.models import adapted, get_model

@@ -26,7 +26,7 @@ from jaxekf.cli.console import (
 )
 from jaxekf.cli.estimate import load_runs
 from jaxekf.estimation import parameters
-from jaxekf.estimation.batch import provenance
+from jaxekf.estimation.versions import provenance
 from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.documents import alignment as documents
 from jaxekf.io.documents import codec

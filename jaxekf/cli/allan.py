@@ -26,7 +26,7 @@ from jaxekf.cli.console import (
     print_table,
 )
 from jaxekf.estimation import parameters
-from jaxekf.estimation.batch import provenance
+from jaxekf.estimation.versions import provenance
 from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.hashes import inputs_of
 from jaxekf.io.run_folder import read_log

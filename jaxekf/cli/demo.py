@@ -11,9 +11,10 @@ import numpy as np
 import tuning
 from jaxekf.cli.comparison import print_comparison
 from jaxekf.cli.console import json_option, note, output_option, print_json, tuning_progress
-from jaxekf.estimation.batch import estimate_many, provenance
+from jaxekf.estimation.batch import estimate_many
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.estimation.result import Estimate
+from jaxekf.estimation.versions import provenance
 from jaxekf.evaluation.diagnosis import diagnose
 from jaxekf.evaluation.metrics import score
 from jaxekf.filtering.model import Parameters

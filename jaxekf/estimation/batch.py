@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from jaxekf.estimation import padding, parameters, timeline
 from jaxekf.estimation.output_times import Every, OutputTimes
 from jaxekf.estimation.result import Estimate, OutputEstimate, SensorRecord
 from jaxekf.estimation.timeline import Timeline
+from jaxekf.estimation.versions import provenance
 from jaxekf.filtering import ekf, smoother
 from jaxekf.filtering.ekf import FilterOutput
 from jaxekf.filtering.model import Belief, Model, Parameters
@@ -453,13 +453,3 @@ def _count_downweighted(record: SensorRecord) -> int:
     """Number of used samples with a robust weight below 0.5 in at least one row."""
     assert record.weight is not None
     return int(((record.weight < 0.5) & record.used).any(axis=1).sum())
-
-
-def provenance() -> dict[str, Any]:
-    """Versions of the packages, precision and backend of an estimate."""
-    names = ("jaxekf", "jax", "jaxlib", "numpy", "optax")
-    return {
-        "versions": {name: version(name) for name in names},
-        "dtype": "float64",
-        "backend": jax.default_backend(),
-    }

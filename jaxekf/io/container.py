@@ -26,9 +26,10 @@ from jaxekf.io.atomic import whole_file
 from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.io.schema import TEXT, Field
 from jaxekf.io.streams import SCHEMAS
-from jaxekf.recordings import facts, screening
+from jaxekf.recordings import facts
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.frozen_poses import without_repeats
+from jaxekf.recordings.quaternion_norms import NORM_ROUNDED
 from jaxekf.recordings.types import STREAMS, Recording
 
 _ROOT = ("kind", "schema_version", "name", "info", "sha256")
@@ -186,12 +187,12 @@ def _as_stored(stream: Any, group: Mapping[str, Any]) -> Any:
     if "q_ref_body" in group:
         stored = group["q_ref_body"]
         with np.errstate(invalid="ignore", over="ignore"):
-            near = np.abs(np.linalg.norm(stored, axis=1) - 1.0) <= screening.NORM_ROUNDED
+            near = np.abs(np.linalg.norm(stored, axis=1) - 1.0) <= NORM_ROUNDED
         as_it_is = near | ~group["valid"] if "valid" in group else near
         kept["q_ref_body"] = np.where(as_it_is[:, None], stored, stream.q_ref_body)
     if "q_body_camera" in group:
         stored = group["q_body_camera"]
-        if abs(np.linalg.norm(stored) - 1.0) <= screening.NORM_ROUNDED:
+        if abs(np.linalg.norm(stored) - 1.0) <= NORM_ROUNDED:
             kept["q_body_camera"] = stored
     if "scored" in group:
         kept["scored"] = group["scored"]

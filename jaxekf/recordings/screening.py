@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf.recordings.accounts import Indices, Intake, Place, Reason
+from jaxekf.recordings.quaternion_norms import judge_quaternions, whole
 from jaxekf.recordings.types import Encoder, Flags, Floats, Imu, Optical, Times
 
-MOST_BAD_NORMS = 0.05
-"""Share of rows with a norm that is no quaternion's, over which the columns are something else."""
-NORM_ROUNDED, NORM_WRONG = 1e-3, 0.1
 SLOWEST_S, SLOWEST_TRACKER_S = 0.5, 1.5
 """Median step from which on a stream is taken for one whose times are in another unit."""
 FASTEST_S = 2e-5
@@ -354,62 +352,6 @@ def huge(values: Floats) -> Flags:
     """Rows (N,) of values (N, c) of which some are beyond what is measured."""
     with np.errstate(invalid="ignore"):
         return np.asarray(((values > _BEYOND) | (values < -_BEYOND)).any(axis=1))
-
-
-def whole(values: Floats) -> Flags:
-    """Rows (N,) of values (N, c) that are finite."""
-    return np.asarray(np.isfinite(values).all(axis=1))
-
-
-def judge_quaternions(
-    place: Place, values: Floats, *, column: str = "qw"
-) -> tuple[Floats, dict[str, Flags], tuple[str, ...]]:
-    """Unit quaternions (N, 4) of what a tracker wrote, reasons to mask rows, and what was scaled.
-
-    What is missing (blank, not finite, zero, or of a norm that no rounding explains) becomes the identity.
-    Raises `RecordingError` where more than 5 % of the rows are of such a norm: these are no quaternions.
-    """
-    blank, lost = np.asarray(np.isnan(values).all(axis=1)), ~whole(values)
-    # Scaled first, so that no square overflows.
-    size = np.max(np.abs(np.where(lost[:, None], 0.0, values)), axis=1, initial=0.0)
-    safe = np.where(size > 0.0, size, 1.0)
-    norm = safe * np.linalg.norm(np.where(lost[:, None], 0.0, values) / safe[:, None], axis=1)
-    zero = ~lost & (norm < 1e-9)
-    off = np.abs(norm - 1.0)
-    wrong = ~lost & ~zero & (off > NORM_WRONG)
-    there = ~lost & ~zero
-    if wrong.sum() > MOST_BAD_NORMS * max(int(there.sum()), 1) and wrong.sum() > 1:
-        first = int(np.flatnonzero(wrong)[0])
-        raise place.error(
-            first,
-            column,
-            f"a norm of {norm[first]:.4g}, and {wrong.sum()} of {there.sum()} quaternions off by more"
-            f" than {NORM_WRONG:g}",
-            "quaternions of norm 1",
-            "checking which columns hold the quaternion",
-        )
-    good = there & ~wrong
-    rounded = good & (off > NORM_ROUNDED)
-    unit = np.zeros_like(values)
-    unit[:, 0] = 1.0
-    unit[good] = values[good] / norm[good, None]
-    # What is a unit quaternion to rounding stays to the last bit, so that what is saved is read again.
-    exact = good & (off < 1e-15)
-    unit[exact] = values[exact]
-    notes: tuple[str, ...] = ()
-    if rounded.any():
-        first, last = (place.number(row) for row in np.flatnonzero(rounded)[[0, -1]])
-        notes = (
-            f"{rounded.sum()} quaternions are scaled to norm 1, off by up to {off[rounded].max():.2g}"
-            f" ({place.unit}s {first} to {last})",
-        )
-    reasons = {
-        "blank": blank,
-        "not finite": lost & ~blank,
-        "missing tool (zero quaternion)": zero,
-        "norm off by more than 0.1": wrong,
-    }
-    return unit, reasons, notes
 
 
 def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> None:

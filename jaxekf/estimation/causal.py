@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from jaxekf._support.compilation import jit
 from jaxekf._support.errors import ModelError
 from jaxekf.estimation import timeline
+from jaxekf.estimation._assembly import named_outputs
 from jaxekf.estimation.batch import (
     Run,
     estimate_many,
     evaluate_outputs,
-    named_outputs,
     read,
     sharing_devices,
 )

@@ -36,7 +36,7 @@ def linear_problem(means):
     )
     sensors = (dataclasses.replace(model.sensors[0], groups=(0, 0, 1)),)
     # The naive filter has no patience to lose.
-    model = dataclasses.replace(model, sensors=sensors, patience_s=1e9)
+    model = dataclasses.replace(model, sensors=sensors, gate_reset_after_s=1e9)
     model = jaxekf.robust(model, means)
     value = rng.standard_normal((12, 1, 3))
     value[[4, 7]] += 5.0

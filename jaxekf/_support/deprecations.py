@@ -2,12 +2,13 @@
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
 from types import ModuleType
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 # Where modules are now: "old>new" where the name changed too, "name" where only the room did.
 _ROOMS = {
@@ -27,13 +28,13 @@ _ROOMS = {
         "consistency diagnostics>diagnosis metrics signatures>_fault_signatures verdicts"
     ),
     "jaxekf.filtering": (
-        "about>_lowered_path algebra>_covariance_algebra backward>_smoother_pass ekf "
+        "about>_lowered_model algebra>_covariance_update backward>_smoother_pass ekf "
         "epochs>_substeps interpolation iterated>iterated_smoother linearise>_linearisation "
         "many>_repeated_groups model outliers>_gating recursion>_recursion "
         "relinearise>_iterated_update smoother step>_step system>_lowered_model"
     ),
     "jaxekf.filtering.lowering": (
-        "blocks group_derivative lanes own_derivative>batched_vjp packed "
+        "blocks>batching group_derivative lanes own_derivative>batched_vjp packed "
         "patterned>structured_matrix programs>scalar_graph reverse_only structure>sparsity"
     ),
     "jaxekf.geometry": (
@@ -126,13 +127,68 @@ def _moved() -> dict[str, str]:
 MOVED = _moved()
 
 
-def moved(name: str, stacklevel: int) -> ModuleType:
-    """The module that was `name`, which is warned of at the caller's line."""
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def warn_renamed(old: str, new: str, stacklevel: int = 2) -> None:
+    """Warn of an old name, at the line of the caller's caller unless given."""
     warnings.warn(
-        f"the module {name} is now {MOVED[name]}; the old name will be gone in the next release",
+        f"{old} is now {new}; the old name will be gone in the next release",
         DeprecationWarning,
         stacklevel=stacklevel + 1,
     )
+
+
+def renamed_arguments(**renamed: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator of a function that takes keyword arguments under their old names too: ``old="new"``."""
+
+    def decorated(function: Callable[P, T]) -> Callable[P, T]:
+        @wraps(function)
+        def call(*args: P.args, **options: P.kwargs) -> T:
+            for old, new in renamed.items():
+                if old in options:
+                    warn_renamed(f"the argument {old} of {function.__name__}", new)
+                    options[new] = options.pop(old)
+            return function(*args, **options)
+
+        return call
+
+    return decorated
+
+
+def renamed_fields(**renamed: str) -> Callable[[type[T]], type[T]]:
+    """Decorator of a dataclass whose fields are set and read by their old names too: ``old="new"``."""
+
+    def decorated(cls: type[T]) -> type[T]:
+        init: Any = cls.__init__
+
+        @wraps(init)
+        def __init__(self: Any, *args: Any, **options: Any) -> None:
+            for old, new in renamed.items():
+                if old in options:
+                    warn_renamed(f"the field {old} of {cls.__name__}", new)
+                    options[new] = options.pop(old)
+            init(self, *args, **options)
+
+        def reader(old: str, new: str) -> property:
+            def read(self: Any) -> Any:
+                warn_renamed(f"the field {old} of {cls.__name__}", new)
+                return getattr(self, new)
+
+            return property(read)
+
+        cls.__init__ = __init__
+        for old, new in renamed.items():
+            setattr(cls, old, reader(old, new))
+        return cls
+
+    return decorated
+
+
+def moved(name: str, stacklevel: int) -> ModuleType:
+    """The module that was `name`, which is warned of at the caller's line."""
+    warn_renamed(f"the module {name}", MOVED[name], stacklevel + 1)
     module = import_module(MOVED[name])
     for old, place in _NAMES.get(name, {}).items():
         home, _, new = place.partition(":")

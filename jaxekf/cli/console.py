@@ -17,7 +17,7 @@ from jaxekf.cli.commands import WRITTEN
 from jaxekf.io.atomic import finite_or_null
 from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.models import REGISTRY
-from jaxekf.models.robust import MEANS
+from jaxekf.models.robust import OUTLIER_METHODS
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print JSON on standard output instead of a table."
@@ -46,8 +46,8 @@ sort_option = click.option(
 )
 robust_option = click.option(
     "--robust",
-    "means",
-    type=click.Choice(MEANS),
+    "outlier_method",
+    type=click.Choice(OUTLIER_METHODS),
     help="What to do with samples that do not fit: gate refuses them, huber and student let them count"
     " less, none takes all in full.  [default: as the model has it]",
 )

@@ -311,9 +311,9 @@ def _collect(
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
         notes += (
             f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
-            f" had refused everything for {model.patience_s} s: the belief was widened, {len(at)} times;"
-            " if these samples are good, the noise is too small for so strict a gate: tune it, or take"
-            " weights instead (robust: huber)",
+            f" had refused everything for {model.gate_reset_after_s} s: the belief was widened, {len(at)}"
+            " times; if these samples are good, the noise is too small for so strict a gate: tune it, or"
+            " take weights instead (robust: huber)",
         )
     if smooth:
         notes += ("smoothed: every instant is estimated from the whole run",)

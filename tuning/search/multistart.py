@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.errors import TuningError
-from jaxekf.filtering.lowering.blocks import LANES
+from jaxekf.filtering.lowering.batching import LANES
 from jaxekf.recordings.types import Floats
 from tuning.objective.data import Data
 from tuning.parametrisation.free_vector import Layout

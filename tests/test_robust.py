@@ -207,3 +207,15 @@ def test_what_a_result_tells(tmp_path):
     assert "weight_x" in head
     assert np.all(made.sensors["optical"].weight <= 1.0)
     assert jaxekf.score(made, run).attitude_rmse_deg < 0.2
+
+
+def test_old_names_work_for_one_release():
+    """A user's script with `means` or `patience_s` that breaks, or works without a warning."""
+    with pytest.warns(DeprecationWarning, match="outlier_method"):
+        model = jaxekf.robust("loose", means="huber")
+    assert model is jaxekf.robust("loose", "huber")
+    with pytest.warns(DeprecationWarning, match="gate_reset_after_s"):
+        changed = dataclasses.replace(model, patience_s=2.0)
+    assert changed.gate_reset_after_s == 2.0
+    with pytest.warns(DeprecationWarning, match="gate_reset_after_s"):
+        assert changed.patience_s == 2.0

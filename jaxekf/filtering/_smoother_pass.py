@@ -22,8 +22,8 @@ from jaxekf.filtering import _covariance_update as covariance_update
 from jaxekf.filtering import _repeated_groups as repeated_groups
 from jaxekf.filtering import _substeps as substeps
 from jaxekf.filtering._covariance_update import UpdateAccumulator
+from jaxekf.filtering._epoch import ScanInit, ScanInputs
 from jaxekf.filtering._lowered_model import BoundModel, LoweredModel
-from jaxekf.filtering._recursion import ScanInit, ScanInputs
 from jaxekf.filtering._step import (
     AppliedSensor,
     FilterCarry,

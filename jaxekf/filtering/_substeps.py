@@ -1,6 +1,6 @@
 """A scan over the substeps of one epoch: fast samples at every substep, slow samples at the last.
 
-The smoothers use it; the filter has its own in `jaxekf.filtering._recursion`, which saves compiling.
+The smoothers use it; the filter has its own, `jaxekf.filtering._epoch`, which compiles the transition once.
 """
 
 from collections.abc import Callable

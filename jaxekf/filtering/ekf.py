@@ -18,10 +18,10 @@ from jaxekf._support.errors import ModelError
 from jaxekf.filtering import _gating as gating
 from jaxekf.filtering import _lowered_model as lowered_model
 from jaxekf.filtering import _recursion as recursion
+from jaxekf.filtering._epoch import SaveSpec, ScanInit, ScanInputs, ScanOutputs
 from jaxekf.filtering._iterated_update import with_iterated_update
 from jaxekf.filtering._linearisation import linearise_sensor
 from jaxekf.filtering._lowered_model import ABOUT_PATH, AT_ESTIMATE, Linearisation, LoweredModel
-from jaxekf.filtering._recursion import SaveSpec, ScanInit, ScanInputs, ScanOutputs
 from jaxekf.filtering._step import SubstepInput
 from jaxekf.filtering.interpolation import InputSample, sample
 from jaxekf.filtering.lowering import batching

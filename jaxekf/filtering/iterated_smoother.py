@@ -24,8 +24,8 @@ from jaxekf.filtering import _step as step
 from jaxekf.filtering import _substeps as substeps
 from jaxekf.filtering import ekf, smoother
 from jaxekf.filtering._covariance_update import UpdateAccumulator
+from jaxekf.filtering._epoch import ScanInputs
 from jaxekf.filtering._lowered_model import ABOUT_PATH, BoundModel, LoweredModel
-from jaxekf.filtering._recursion import ScanInputs
 from jaxekf.filtering._smoother_pass import Information
 from jaxekf.filtering._step import SubstepInput
 from jaxekf.filtering.lowering import structured_matrix

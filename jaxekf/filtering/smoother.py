@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxekf.filtering import ekf
+from jaxekf.filtering._epoch import ScanInit
 from jaxekf.filtering._lowered_model import LoweredModel
-from jaxekf.filtering._recursion import ScanInit
 from jaxekf.filtering._smoother_pass import FilteredBeliefs, smooth_backward
 from jaxekf.filtering.ekf import FilterOutput
 from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp

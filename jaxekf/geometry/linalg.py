@@ -1,8 +1,9 @@
 """Small dense linear algebra for the filter: sizes are static and tiny, so loops are unrolled.
 
 Inside a ``lax.scan`` on a CPU a call to LAPACK, or a tiny ``dot``, costs far more than its
-arithmetic; these functions are plain arithmetic which XLA fuses. Matrices stand on the **first** axes;
-whatever axes follow are *lanes*: independent problems, usually runs, side by side in memory.
+arithmetic; these functions are plain arithmetic which XLA fuses. Matrices have the **first** axes; any
+further axes are batch axes. The products are for model code, which is written for one run; the filter has
+those of `jaxekf.filtering.lowering.batched_products`.
 """
 
 import jax.numpy as jnp
@@ -45,8 +46,8 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
     """Lower factor ``L`` (dim, dim), ``L @ L.T`` the covariance, of a noise parameter.
 
     A noise parameter is a standard deviation for all axes, shape (); one for each axis, shape
-    (dim,); or already a lower-triangular factor, shape (dim, dim). What lies above the diagonal of
-    a factor is ignored.
+    (dim,); or already a lower-triangular factor, shape (dim, dim), of which only the lower triangle is
+    used.
     """
     deviation = jnp.asarray(deviation)
     if deviation.ndim == 0:
@@ -70,8 +71,8 @@ def covariance(deviation: Array, dim: int) -> Array:
 def mask_covariance(matrix: Array, mask: Array) -> Array:
     """``matrix`` with hidden rows and columns replaced by those of the identity, (m, m, ...), (m, ...).
 
-    What is left is exactly the visible sub-block, so that a factor of it whitens the visible rows
-    as if the hidden ones had never been there, correlations included.
+    A Cholesky factor of the result whitens the visible rows like a factor of the visible sub-block alone,
+    correlations included.
     """
     both = mask[:, None] & mask[None, :]
     return jnp.where(both, matrix, identity_like(matrix))
@@ -105,14 +106,14 @@ def whitener(matrix: Array) -> tuple[Array, Array]:
 def semidefinite_factor(matrix: Array) -> Array:
     """Lower factor ``L``, ``L @ L.T == matrix``, of a positive semidefinite matrix, (n, n, ...).
 
-    Where nothing but rounding is left of a variance its column is zero, with derivative zero. NaN
-    where the matrix is not semidefinite.
+    A column whose variance is zero but for rounding is zero, with derivative zero. NaN where the matrix is
+    not semidefinite.
     """
     size = matrix.shape[0]
     index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
     scale = diagonal(lax.stop_gradient(matrix))
     deviation = jnp.sqrt(jnp.maximum(scale, 0.0))
-    # Root of what rounding may leave of each variance. Taking out a small variance makes it larger.
+    # Root of the rounding error of each variance; eliminating a small variance makes it larger.
     slack = jnp.sqrt(8.0 * size * jnp.finfo(matrix.dtype).eps) * deviation
     columns: list[Array] = []
     for j in range(size):
@@ -120,7 +121,7 @@ def semidefinite_factor(matrix: Array) -> Array:
         for column in columns:
             rest = rest - column * column[j][None]
         positive = rest[j] > slack[j] * slack[j]
-        # By Schwarz' inequality little is left of the covariances either.
+        # By Schwarz' inequality the covariances of a zero variance are small, too.
         much = (index > j) & (jnp.abs(rest) > 2.0 * slack[j][None] * deviation)
         empty = (rest[j] >= -slack[j] * slack[j]) & (scale[j] >= 0.0) & ~jnp.any(much, axis=0)
         inverse = lax.rsqrt(jnp.where(positive, rest[j], 1.0))

@@ -45,7 +45,7 @@ def batched_with_vjp(devices: Devices, scan: Callable[..., Any]) -> Callable[...
 
 
 def batched(scan: Callable[..., Any], *trees: Any) -> Any:
-    """Call a scan of trees with lanes last for many runs on the first axis, with all of JAX's derivatives."""
+    """Call a scan of trees with lanes last for many runs on the first axis; derivatives are JAX's own."""
     return map_batches((), lambda _, *trees: (scan(*trees), None), None, *trees)[0]
 
 

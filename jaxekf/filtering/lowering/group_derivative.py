@@ -313,7 +313,7 @@ def _differentiate(
 def _output_columns(
     operation: Operation, values: list[Any], columns: list[Any], found: list[Any]
 ) -> Sequence[Any]:
-    """Columns of the outputs from those of the operands; None for an operand that does not depend on the part."""
+    """Columns of the outputs from those of the operands; None for an operand without any."""
     name = operation.primitive.name
     if not any(jnp.issubdtype(spec.dtype, jnp.inexact) for spec in operation.shapes):
         return [None] * len(operation.outputs)

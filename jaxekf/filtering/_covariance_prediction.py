@@ -77,13 +77,13 @@ def _congruence_vjp(
 
     `half` is ``M P`` and `cotangent` is B.
     """
-    back, turned = p.transposed, structured_matrix.transpose_bands(bands)
-    first = materialise(structured_matrix.multiply(back, turned, cotangent))
+    back, transposed = p.transposed, structured_matrix.transpose_bands(bands)
+    first = materialise(structured_matrix.multiply(back, transposed, cotangent))
     if diagonal:
         matrix = structured_matrix.to_dense(p, bands, half.shape[-1], half.dtype)
         cov = pairwise_sum(first * matrix.swapaxes(0, 1), 1)
     else:
-        cov = structured_matrix.multiply(back, turned, first, axis=1)
+        cov = structured_matrix.multiply(back, transposed, first, axis=1)
 
     def band_cotangent(rows: tuple[int, ...], cols: tuple[int, ...]) -> Array:
         above = structured_matrix.take_slices(cotangent, rows, 0)

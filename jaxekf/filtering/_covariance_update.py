@@ -67,7 +67,7 @@ class UpdateAccumulator(NamedTuple):
 
 
 class AppliedBlock(NamedTuple):
-    """What the way back through a block of rows needs of it; 0 in hidden rows."""
+    """The factors of a block of rows that its derivative and the smoother need; 0 in hidden rows."""
 
     gain: Array
     """Transposed gain ``K' = S^-1 H P``, (m, n, lanes)."""
@@ -93,8 +93,8 @@ class RowBlock(NamedTuple):
 
     def transposed_multiply(self, x: Array, axis: int = 0) -> Array:
         """``H' x``; with ``axis=1`` ``x H``."""
-        turned = structured_matrix.transpose_bands(self.bands)
-        return structured_matrix.multiply(self.pattern.transposed, turned, x, axis)
+        transposed = structured_matrix.transpose_bands(self.bands)
+        return structured_matrix.multiply(self.pattern.transposed, transposed, x, axis)
 
     def masked(self, x: Array) -> Array:
         """`x`, (m, ..., lanes), with 0 in hidden rows."""
@@ -164,8 +164,8 @@ def _ldl_inverse(matrix: Array) -> tuple[Array, list[Array]]:
             known = [c * s for c, s in zip(factor[j], scaled, strict=True)]
             scaled.append(unrolled_sum([matrix[i, j : j + 1], *(-k for k in known)]))
         row = [s * inverse for s, inverse in zip(scaled, inverses, strict=True)]
-        gone = [-(c * s) for c, s in zip(row, scaled, strict=True)]
-        pivots.append(unrolled_sum([matrix[i, i : i + 1], *gone]))
+        eliminated = [-(c * s) for c, s in zip(row, scaled, strict=True)]
+        pivots.append(unrolled_sum([matrix[i, i : i + 1], *eliminated]))
         inverses.append(materialise(1.0 / pivots[i]))
         unit = jnp.broadcast_to(np.eye(size)[i][:, None], (size, lanes))
         if i:
@@ -191,7 +191,7 @@ def apply_block(
     cov, delta
         P and the error vector after the block.
     applied
-        What the way back needs.
+        The factors that derivative and smoother need.
     cross
         ``H P``, (m, n, lanes).
     smallest
@@ -289,7 +289,7 @@ def information_before_block(
 
 
 class _SavedUpdate(NamedTuple):
-    """What the derivative of an update needs of it."""
+    """The residuals of the VJP of an update."""
 
     cov: Array
     """P after all rows."""

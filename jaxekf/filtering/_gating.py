@@ -223,7 +223,7 @@ def _apply_gates(
 
 
 class _GateTally(NamedTuple):
-    """What the gates of all sensors did at one instant, each (lanes,)."""
+    """Summary of the gates of all sensors at one instant, each (lanes,)."""
 
     accepted: Array
     rejected: Array

@@ -151,9 +151,9 @@ def _information_before_prediction(
 
 def pull_back(p: Pattern, bands: Bands, info: Information) -> Information:
     """``M' a`` and ``M' L M``: information on ``M x`` as information on ``x``."""
-    back, turned = p.transposed, structured_matrix.transpose_bands(bands)
-    vector = materialise(structured_matrix.multiply(back, turned, info.vector))
-    matrix = covariance_prediction.congruence(back, turned, info.matrix)
+    back, transposed = p.transposed, structured_matrix.transpose_bands(bands)
+    vector = materialise(structured_matrix.multiply(back, transposed, info.vector))
+    matrix = covariance_prediction.congruence(back, transposed, info.matrix)
     return Information(vector, linalg.symmetrise(matrix))
 
 

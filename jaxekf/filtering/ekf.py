@@ -76,8 +76,8 @@ class Instant(NamedTuple):
     healthy: Array
     """False where a covariance is not finite or not definite."""
     recovered: Array | None
-    """Where the gates were reset and the belief was widened (see `Model.gate_reset_after_s`); None without
-    gates, or if not kept."""
+    """True where the gates were reset and the belief was widened (see `Model.gate_reset_after_s`); None
+    without gates, or if not kept."""
     refused: Array | None
     """Seconds of samples that gates have rejected since they last accepted one; None likewise."""
 

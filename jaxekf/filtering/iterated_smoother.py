@@ -267,9 +267,9 @@ def _information_before_transition(
     """The information before a transition, and the most probable process noise of it, ``Q G' a``."""
     transition = bound.lowered.transition
     _, f, g, sigma = _linearise_transition(bound, own)
-    turned = structured_matrix.transpose_bands(g)
+    transposed = structured_matrix.transpose_bands(g)
     back = transition.g_pattern.transposed
-    drawn = materialise(structured_matrix.multiply(back, turned, info.vector))
+    drawn = materialise(structured_matrix.multiply(back, transposed, info.vector))
     is_diagonal = transition.has_diagonal_noise
     noise = sigma * drawn if is_diagonal else materialise(multiply_vector(sigma, drawn))
     return smoother_pass.pull_back(transition.f_pattern, f, info), noise

@@ -99,16 +99,16 @@ def map_batches(
     """
     runs = jax.tree.leaves(trees)[0].shape[0]
 
-    def one(given: Any) -> Any:
-        batches, trees = given
+    def one(batch_inputs: Any) -> Any:
+        batches, trees = batch_inputs
         first, second = function(batches, *_lanes_last(trees))
         return _lanes_first(first), second
 
-    given = (batches, _split_runs(trees, devices))
+    batch_inputs = (batches, _split_runs(trees, devices))
     count = batch_shape(runs, devices)[0]
     shared = _device_count(count, devices)
     if count == 1:
-        found = one(jax.tree.map(lambda a: a[0], given))
+        found = one(jax.tree.map(lambda a: a[0], batch_inputs))
         first, second = jax.tree.map(lambda a: a[None], found)
     elif shared:
         mesh = jax.sharding.Mesh(np.array(devices[:shared]), ("runs",))
@@ -116,9 +116,9 @@ def map_batches(
         split = jax.shard_map(
             partial(lax.map, one), mesh=mesh, in_specs=along, out_specs=along, check_vma=False
         )
-        first, second = split(given)
+        first, second = split(batch_inputs)
     else:
-        first, second = lax.map(one, given)
+        first, second = lax.map(one, batch_inputs)
     return _merge_runs(first, runs), second
 
 
@@ -130,7 +130,7 @@ def vmap_as_more_runs(devices: Devices, function: Callable[..., Any]) -> Callabl
 
     @cache
     def mapped(tree: Any) -> Any:
-        # Arguments are leaves: the derivative of `custom_vmap` takes no None among them.
+        # The arguments are leaves, since the derivative of `custom_vmap` does not accept None.
         flat = custom_vmap(lambda leaves: function(*jax.tree.unflatten(tree, leaves)))
         flat.def_vmap(partial(rule, tree))
         return flat
@@ -142,10 +142,10 @@ def vmap_as_more_runs(devices: Devices, function: Callable[..., Any]) -> Callabl
     def rule(tree: Any, size: int, batched: Any, leaves: Any) -> Any:
         batches, *trees = jax.tree.unflatten(tree, leaves)
         if not any(jax.tree.leaves(batched)):
-            # A derivative is taken in several directions at once: the runs are as many as before.
+            # No argument is batched, as in a derivative in several directions: the runs stay as they are.
             found = function(batches, *trees)
             return found, jax.tree.map(lambda _: False, found)
-        batches_batched, *trees_batched = jax.tree.unflatten(tree, *batched)
+        batched_flags, *trees_batched = jax.tree.unflatten(tree, *batched)
 
         def merge(flag: bool, a: Array) -> Array:
             if not flag:
@@ -154,7 +154,7 @@ def vmap_as_more_runs(devices: Devices, function: Callable[..., Any]) -> Callabl
 
         merged = jax.tree.map(merge, trees_batched, trees)
         if batches is not None:
-            batches = _merge_batches(devices, size, batches_batched, batches)
+            batches = _merge_batches(devices, size, batched_flags, batches)
         found, left = call(batches, *merged)
         found = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), found)
         flags = jax.tree.map(lambda _: True, found)
@@ -163,10 +163,8 @@ def vmap_as_more_runs(devices: Devices, function: Callable[..., Any]) -> Callabl
         runs = left.runs.reshape(size, -1)
         unbatched = jax.tree.map(lambda _: False, left.arrays)
         batched_runs: Any = True
-        return (found, BatchedArrays(left.arrays, runs)), (
-            flags,
-            BatchedArrays(unbatched, batched_runs),
-        )
+        merged_left = BatchedArrays(left.arrays, runs)
+        return (found, merged_left), (flags, BatchedArrays(unbatched, batched_runs))
 
     return call
 
@@ -174,7 +172,7 @@ def vmap_as_more_runs(devices: Devices, function: Callable[..., Any]) -> Callabl
 def _merge_batches(
     devices: Devices, size: int, batched: BatchedArrays, batches: BatchedArrays
 ) -> BatchedArrays:
-    """BatchedArrays of all runs of a `vmap` of the given size."""
+    """The batches of all runs of a `vmap` of the batch_inputs size; `batched` are its flags."""
     runs = batches.runs.reshape(-1) if batched.runs else jnp.tile(batches.runs, size)
     if batched.runs and not any(jax.tree.leaves(batched.arrays)):
         # Made under the same `vmap`: the batches hold the runs of all its members already.

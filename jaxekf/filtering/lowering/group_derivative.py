@@ -123,10 +123,10 @@ def _propagate(
 
     for operation in program.operations:
         operands = [value(i) for i in operation.inputs]
-        given = [tangent(i) for i in operation.inputs]
-        found, ends = _step(operation, operands, given, fallbacks)
+        own = [tangent(i) for i in operation.inputs]
+        found, results = _step(operation, operands, own, fallbacks)
         values.update(zip(operation.outputs, found, strict=True))
-        tangents.update(zip(operation.outputs, ends, strict=True))
+        tangents.update(zip(operation.outputs, results, strict=True))
     return [value(o) for o in program.outputs], [tangent(o) for o in program.outputs]
 
 
@@ -235,26 +235,26 @@ def _skew_times(vector: Any, columns: Any) -> Array:
 
 def _rotate(found: Any, values: list[Any], by: list[dict[int, Any]]) -> Tangent:
     matrix = rotation.to_matrix(values[0])
-    turned = {}
+    by_rotation = {}
     for part, columns in by[0].items():
         if _is_identity(columns):
             # A row r of R makes r' [v] = (r x v)'.
-            turned[part] = -rotation.cross(matrix, jnp.broadcast_to(values[1], (3, 3)))
+            by_rotation[part] = -rotation.cross(matrix, jnp.broadcast_to(values[1], (3, 3)))
         else:
-            turned[part] = -(matrix @ _skew_times(values[1], columns))
-    return Tangent(False, _sum(turned, _multiply_columns(matrix, by[1])))
+            by_rotation[part] = -(matrix @ _skew_times(values[1], columns))
+    return Tangent(False, _sum(by_rotation, _multiply_columns(matrix, by[1])))
 
 
 def _rotate_inverse(found: Any, values: list[Any], by: list[dict[int, Any]]) -> Tangent:
-    turned = {part: _skew_times(found, columns) for part, columns in by[0].items()}
-    moved = _multiply_columns(rotation.to_matrix(values[0]).T, by[1]) if by[1] else {}
-    return Tangent(False, _sum(turned, moved))
+    by_rotation = {part: _skew_times(found, columns) for part, columns in by[0].items()}
+    by_vector = _multiply_columns(rotation.to_matrix(values[0]).T, by[1]) if by[1] else {}
+    return Tangent(False, _sum(by_rotation, by_vector))
 
 
 def _to_matrix(found: Any, values: list[Any], by: list[dict[int, Any]]) -> Tangent:
     # Column j of R [theta] is R (theta x e_j).
-    turned = jnp.stack([-(found @ rotation.skew(jnp.asarray(e))) for e in np.eye(3)], axis=1)
-    return Tangent(False, {part: turned @ columns for part, columns in by[0].items()})
+    by_rotation = jnp.stack([-(found @ rotation.skew(jnp.asarray(e))) for e in np.eye(3)], axis=1)
+    return Tangent(False, {part: by_rotation @ columns for part, columns in by[0].items()})
 
 
 def _pass_through(found: Any, values: list[Any], by: list[dict[int, Any]]) -> Tangent:
@@ -280,15 +280,8 @@ _RULES = {
 
 _LINEAR = frozenset(
     [
-        *(
-            "broadcast_in_dim",
-            "concatenate",
-            "convert_element_type",
-            "copy",
-            "copy_p",
-            "neg",
-            "reduce_sum",
-        ),
+        *("broadcast_in_dim", "concatenate", "convert_element_type", "copy", "copy_p", "neg"),
+        "reduce_sum",
         *("reshape", "rev", "slice", "split", "squeeze", "stack", "transpose", "unstack"),
     ]
 )
@@ -299,15 +292,15 @@ def _differentiate(
     operation: Operation, values: list[Any], by: list[dict[int, Any]], found: list[Any]
 ) -> list[Tangent]:
     parts = list(dict.fromkeys(part for one in by for part in one))
-    ends: list[dict[int, Any]] = [{} for _ in operation.outputs]
+    columns_of: list[dict[int, Any]] = [{} for _ in operation.outputs]
     for part in parts:
         columns = [one.get(part) for one in by]
         for end, tangent in zip(
-            ends, _output_columns(operation, values, columns, found), strict=True
+            columns_of, _output_columns(operation, values, columns, found), strict=True
         ):
             if tangent is not None:
                 end[part] = tangent
-    return [Tangent(False, end) for end in ends]
+    return [Tangent(False, columns) for columns in columns_of]
 
 
 def _output_columns(
@@ -319,11 +312,11 @@ def _output_columns(
         return [None] * len(operation.outputs)
     count = next(c.shape[-1] for c in columns if c is not None)
     if name in _LINEAR:
-        given = [
+        operands = [
             Unbatched(np.zeros(spec.shape, spec.dtype)) if c is None else c
             for c, spec in zip(columns, operation.operands, strict=True)
         ]
-        return lanes.apply_operation(operation, given, count)
+        return lanes.apply_operation(operation, operands, count)
     if name in _SUMS:
         terms = [
             c if sign == 1 else -c
@@ -386,5 +379,5 @@ def _by_vmap(operation: Operation, values: list[Any], columns: list[Any]) -> Seq
 
         return jax.jvp(function, tuple(values[i] for i in moving), changes)[1]
 
-    given = [jnp.asarray(columns[i]) for i in moving]
-    return jax.vmap(one, in_axes=-1, out_axes=-1)(*given)
+    operands = [jnp.asarray(columns[i]) for i in moving]
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(*operands)

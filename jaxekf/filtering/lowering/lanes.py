@@ -30,20 +30,10 @@ _COSTLY = {"div": 6.0, "rsqrt": 6.0, "sqrt": 6.0} | dict.fromkeys(
 """Cost of one entry, in additions."""
 ELEMENTWISE = frozenset(
     [
-        *(
-            "abs",
-            "add",
-            "add_any",
-            "and",
-            "ceil",
-            "clamp",
-            "convert_element_type",
-            "copy",
-            "copy_p",
-        ),
-        *("eq", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lt", "max", "min", "mul"),
-        *("ne", "neg", "nextafter", "not", "or", "round", "select_n", "sign", "square"),
-        *("stop_gradient", "sub", "xor", *_COSTLY),
+        *("abs", "add", "add_any", "and", "ceil", "clamp", "convert_element_type", "copy"),
+        *("copy_p", "eq", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lt", "max"),
+        *("min", "mul", "ne", "neg", "nextafter", "not", "or", "round", "select_n", "sign"),
+        *("square", "stop_gradient", "sub", "xor", *_COSTLY),
     ]
 )
 """Elementwise operations."""
@@ -199,7 +189,7 @@ def _values_to_materialise(program: Program) -> set[int]:
                 uses.setdefault(i, []).append(operation)
     cost: dict[int, float] = dict.fromkeys(range(len(program.inputs)), 0.0)
     kept: set[int] = set()
-    ends = {o for o in program.outputs if not isinstance(o, Constant)}
+    results = {o for o in program.outputs if not isinstance(o, Constant)}
     for operation in program.operations:
         inside = [
             0.0 if i in kept else cost[i] for i in operation.inputs if not isinstance(i, Constant)
@@ -207,7 +197,7 @@ def _values_to_materialise(program: Program) -> set[int]:
         own = _own_cost(operation) + sum(inside) * _reads_per_entry(operation)
         for output, spec in zip(operation.outputs, operation.shapes, strict=True):
             size = int(np.prod(spec.shape, dtype=int))
-            reads = sum(map(_reads, uses.get(output, ()))) + (size if output in ends else 0)
+            reads = sum(map(_reads, uses.get(output, ()))) + (size if output in results else 0)
             cost[output] = own
             if own > 0.0 and ((reads - size) * own >= _RECOMPUTATION_LIMIT or own > _LOOP_LIMIT):
                 kept.add(output)

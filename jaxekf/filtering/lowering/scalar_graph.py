@@ -38,8 +38,8 @@ class Operation(NamedTuple):
     def bind(self, values: Sequence[Any]) -> list[Any]:
         """The outputs for the given operands."""
         # Until JAX 0.7 functions among the parameters were returned separately.
-        given = self.primitive.get_bind_params(self.params)
-        functions, params = given if isinstance(given, tuple) else ((), given)
+        bound = self.primitive.get_bind_params(self.params)
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)
         found = self.primitive.bind(*functions, *values, **params)
         return list(found) if self.primitive.multiple_results else [found]
 
@@ -230,9 +230,9 @@ def _flatten(
             found = list(range(counter[0], counter[0] + len(eqn.outvars)))
             counter[0] += len(found)
             shapes = tuple(_spec(v) for v in eqn.outvars)
-            given = tuple(_spec(atom) for atom in eqn.invars)
-            ends = (tuple(operands), tuple(found), shapes, given)
-            operations.append(Operation(eqn.primitive, dict(eqn.params), *ends))
+            operand_specs = tuple(_spec(atom) for atom in eqn.invars)
+            fields = (tuple(operands), tuple(found), shapes, operand_specs)
+            operations.append(Operation(eqn.primitive, dict(eqn.params), *fields))
         number.update(zip(eqn.outvars, found, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 

@@ -13,7 +13,8 @@ import numpy as np
 from jax import Array, lax
 from numpy.typing import NDArray
 
-from jaxekf.filtering.lowering.lanes import broadcast_axes, materialise, pairwise_sum, unrolled_sum
+from jaxekf.filtering.lowering import batched_products
+from jaxekf.filtering.lowering.lanes import materialise, unrolled_sum
 from jaxekf.filtering.lowering.sparsity import KnownEntries
 
 _FILL_LIMIT = 1.3
@@ -155,11 +156,9 @@ def _write_slice(whole: Array, part: Array, start: tuple[int, ...]) -> Array:
     A concatenation fused with its operands would test for every entry which operand it is in, and XLA would
     not vectorise that loop.
     """
-    return (
-        part
-        if part.shape == whole.shape
-        else materialise(lax.dynamic_update_slice(whole, part, start))
-    )
+    if part.shape == whole.shape:
+        return part
+    return materialise(lax.dynamic_update_slice(whole, part, start))
 
 
 def multiply(p: Pattern, bands: Bands, x: Array, axis: int = 0) -> Array:
@@ -210,21 +209,11 @@ def _multiply_band(band: Array, cols: tuple[int, ...], x: Array, axis: int) -> A
         block = lax.slice_in_dim(band, start, start + len(run), axis=1)
         start += len(run)
         if x.ndim == 2:
-            terms.append(pairwise_sum(block * broadcast_axes(part, block.shape, 1), 1))
+            terms.append(batched_products.multiply_vector(block, part))
         elif axis == 0:
-            shape = (*block.shape[:2], *part.shape[1:])
-            terms.append(
-                pairwise_sum(
-                    broadcast_axes(block, shape, 0, 1) * broadcast_axes(part, shape, 1, 2), 1
-                )
-            )
+            terms.append(batched_products.multiply(block, part))
         else:
-            shape = (part.shape[0], *block.shape)
-            terms.append(
-                pairwise_sum(
-                    broadcast_axes(part, shape, 0, 2) * broadcast_axes(block, shape, 1, 2), 2
-                )
-            )
+            terms.append(batched_products.multiply_transposed(part, block))
     return unrolled_sum(terms)
 
 

@@ -58,13 +58,15 @@ def test_four_free_numbers_are_not_taken_for_a_rotation():
     expected = jax.jacfwd(function, (0, 1))(q, v)
     np.testing.assert_allclose(found.blocks[0, 0], expected[0], atol=1e-14)
     np.testing.assert_allclose(found.blocks[0, 1], expected[1], atol=1e-14)
-    assert not found.left
+    assert not found.fallbacks
 
 
 def test_what_leaves_the_group_is_named():
     """A function that takes a quaternion apart, of which nothing is said."""
     q = rotation.identity()
     found = derivative(lambda q: q[1:] * 2.0, (q,), ([SO3()],), [Euclidean(3)])
-    assert found.left
-    assert not derivative(lambda q: rotation.conjugate(q), (q,), ([SO3()],), [SO3()]).left
-    assert not derivative(lambda q: rotation.to_matrix(q)[0], (q,), ([SO3()],), [Euclidean(3)]).left
+    assert found.fallbacks
+    assert not derivative(lambda q: rotation.conjugate(q), (q,), ([SO3()],), [SO3()]).fallbacks
+    assert not derivative(
+        lambda q: rotation.to_matrix(q)[0], (q,), ([SO3()],), [Euclidean(3)]
+    ).fallbacks

@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 import jaxekf
-from jaxekf.filtering.lowering.packed import packed
+from jaxekf.filtering.lowering.packed import pack
 
 
 def test_a_scan_over_packed_arrays_is_the_scan():
@@ -27,16 +27,16 @@ def test_a_scan_over_packed_arrays_is_the_scan():
         return total, {"total": total, "turned": at["matrix"].swapaxes(0, 1), "mask": at["mask"]}
 
     def put_together(total, at):
-        total, found = plain(total, at.opened())
-        return total, packed(found)
+        total, found = plain(total, at.unpack())
+        return total, pack(found)
 
     wanted = lax.scan(plain, 0.0, steps)
-    total, found = lax.scan(put_together, 0.0, packed(steps, 1))
+    total, found = lax.scan(put_together, 0.0, pack(steps, 1))
     np.testing.assert_array_equal(total, wanted[0])
-    for a, b in zip(jax.tree.leaves(found.opened()), jax.tree.leaves(wanted[1]), strict=True):
+    for a, b in zip(jax.tree.leaves(found.unpack()), jax.tree.leaves(wanted[1]), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
-    assert len(jax.tree.leaves(packed(steps, 1))) == 2
+    assert len(jax.tree.leaves(pack(steps, 1))) == 2
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def linear_problem(means):
     )
     sensors = (dataclasses.replace(model.sensors[0], groups=(0, 0, 1)),)
     # The naive filter has no patience to lose.
-    model = dataclasses.replace(model, sensors=sensors, patience_s=1e9)
+    model = dataclasses.replace(model, sensors=sensors, gate_reset_after_s=1e9)
     model = jaxekf.robust(model, means)
     value = rng.standard_normal((12, 1, 3))
     value[[4, 7]] += 5.0
@@ -207,3 +207,15 @@ def test_what_a_result_tells(tmp_path):
     assert "weight_x" in head
     assert np.all(made.sensors["optical"].weight <= 1.0)
     assert jaxekf.score(made, run).attitude_rmse_deg < 0.2
+
+
+def test_old_names_work_for_one_release():
+    """A user's script with `means` or `patience_s` that breaks, or works without a warning."""
+    with pytest.warns(DeprecationWarning, match="outlier_method"):
+        model = jaxekf.robust("loose", means="huber")
+    assert model is jaxekf.robust("loose", "huber")
+    with pytest.warns(DeprecationWarning, match="gate_reset_after_s"):
+        changed = dataclasses.replace(model, patience_s=2.0)
+    assert changed.gate_reset_after_s == 2.0
+    with pytest.warns(DeprecationWarning, match="gate_reset_after_s"):
+        assert changed.patience_s == 2.0

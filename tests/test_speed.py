@@ -14,7 +14,7 @@ from jaxekf._support.errors import ModelError
 from jaxekf.estimation import batch, padding, timeline
 from jaxekf.filtering import _recursion as recursion
 from jaxekf.filtering import ekf
-from jaxekf.filtering.lowering import blocks, lanes, scalar_graph, sparsity, structured_matrix
+from jaxekf.filtering.lowering import batching, lanes, scalar_graph, sparsity, structured_matrix
 from jaxekf.filtering.model import Belief
 from jaxekf.models import get_model
 from jaxekf.simulation import attitude_runs
@@ -31,19 +31,21 @@ def test_structure_is_found_where_it_is():
         first = jnp.concatenate([x[:1], jnp.ones(2)])
         return matrix * first[:, None] + jnp.zeros((3, 3)) * x[None]
 
-    found = sparsity.find(scalar_graph.trace(function, x))
+    found = sparsity.known_entries(scalar_graph.trace(function, x))
     expected = np.array([[False, True, False], [True] * 3, [True] * 3])
     np.testing.assert_array_equal(found.known, expected)
     np.testing.assert_array_equal(found.value[1:], [[0, 0, 1], [0, 1, 0]])
-    form = structured_matrix.pattern(found)
+    form = structured_matrix.find_pattern(found)
     assert form.bands == (((0,), (0, 2)),)
 
 
 def test_what_is_not_understood_is_not_called_known():
     """An operation without a rule that is taken for constant."""
-    opaque = sparsity.find(scalar_graph.trace(lambda x: jnp.sort(x) * 1.0, jnp.ones(3)))
+    opaque = sparsity.known_entries(scalar_graph.trace(lambda x: jnp.sort(x) * 1.0, jnp.ones(3)))
     assert not opaque.known.any()
-    mixed = sparsity.find(scalar_graph.trace(lambda x: jnp.sort(x.at[1:].set(0.0)), jnp.ones(3)))
+    mixed = sparsity.known_entries(
+        scalar_graph.trace(lambda x: jnp.sort(x.at[1:].set(0.0)), jnp.ones(3))
+    )
     assert not mixed.known.any()
 
 
@@ -67,7 +69,7 @@ def test_values_on_lanes_are_those_of_the_function(name):
     x, m = rng.normal(size=(5, 3)), np.eye(3) + 0.1 * rng.normal(size=(5, 3, 3))
     program = scalar_graph.trace(functions[name], x[0], m[0])
     values = [jnp.moveaxis(jnp.asarray(a), 0, -1) for a in (x, m)]
-    found = jnp.moveaxis(lanes.evaluate(sparsity.simplified(program), values), -1, 0)
+    found = jnp.moveaxis(lanes.evaluate(sparsity.simplify(program), values), -1, 0)
     np.testing.assert_allclose(found, jax.vmap(functions[name])(x, m), rtol=1e-13, atol=1e-14)
 
 
@@ -220,7 +222,7 @@ def test_what_is_not_kept_changes_nothing():
 
 def test_blocks_of_runs(monkeypatch):
     """A run that changes when it stands in another block, beside others, or beside filling."""
-    monkeypatch.setattr(blocks, "LANES", 2)
+    monkeypatch.setattr(batching, "LANES", 2)
     recursion._with_adjoint.cache_clear()
     model, params, belief, steps = small()
     factors = jnp.linspace(0.5, 1.5, 5)

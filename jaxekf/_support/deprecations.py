@@ -28,13 +28,13 @@ _ROOMS = {
         "consistency diagnostics>diagnosis metrics signatures>_fault_signatures verdicts"
     ),
     "jaxekf.filtering": (
-        "about>_lowered_path algebra>_covariance_algebra backward>_smoother_pass ekf "
+        "about>_lowered_model algebra>_covariance_update backward>_smoother_pass ekf "
         "epochs>_substeps interpolation iterated>iterated_smoother linearise>_linearisation "
         "many>_repeated_groups model outliers>_gating recursion>_recursion "
         "relinearise>_iterated_update smoother step>_step system>_lowered_model"
     ),
     "jaxekf.filtering.lowering": (
-        "blocks group_derivative lanes own_derivative>batched_vjp packed "
+        "blocks>batching group_derivative lanes own_derivative>batched_vjp packed "
         "patterned>structured_matrix programs>scalar_graph reverse_only structure>sparsity"
     ),
     "jaxekf.geometry": (
@@ -165,6 +165,35 @@ def renamed_arguments(**renamed: str) -> Callable[[Callable[P, T]], Callable[P, 
             return function(*args, **options)
 
         return call
+
+    return decorated
+
+
+def renamed_fields(**renamed: str) -> Callable[[type[T]], type[T]]:
+    """Decorator of a dataclass whose fields are set and read by their old names too: ``old="new"``."""
+
+    def decorated(cls: type[T]) -> type[T]:
+        init: Any = cls.__init__
+
+        @wraps(init)
+        def __init__(self: Any, *args: Any, **options: Any) -> None:
+            for old, new in renamed.items():
+                if old in options:
+                    warn_renamed(f"the field {old} of {cls.__name__}", new)
+                    options[new] = options.pop(old)
+            init(self, *args, **options)
+
+        def reader(old: str, new: str) -> property:
+            def read(self: Any) -> Any:
+                warn_renamed(f"the field {old} of {cls.__name__}", new)
+                return getattr(self, new)
+
+            return property(read)
+
+        cls.__init__ = __init__
+        for old, new in renamed.items():
+            setattr(cls, old, reader(old, new))
+        return cls
 
     return decorated
 

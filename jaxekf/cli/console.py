@@ -17,7 +17,7 @@ from jaxekf.cli.commands import WRITTEN
 from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
-from jaxekf.models.robust import MEANS
+from jaxekf.models.robust import OUTLIER_METHODS
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="JSON on standard output instead of a table."
@@ -47,8 +47,8 @@ sort_option = click.option(
 )
 robust_option = click.option(
     "--robust",
-    "means",
-    type=click.Choice(MEANS),
+    "outlier_method",
+    type=click.Choice(OUTLIER_METHODS),
     help="Treatment of outliers: gate rejects them, huber and student reduce their weight (Huber or"
     " Student-t), none uses all samples with full weight.  [default: as in the model]",
 )

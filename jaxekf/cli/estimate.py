@@ -35,7 +35,7 @@ from jaxekf.io import run_folder
 from jaxekf.io.atomic import check_output
 from jaxekf.io.export import FILES
 from jaxekf.models import get_model
-from jaxekf.models.robust import Means, robust
+from jaxekf.models.robust import OutlierMethod, robust
 from jaxekf.recordings.gaps import split_at_gaps
 from jaxekf.recordings.types import Recording
 
@@ -176,7 +176,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
 def estimate(
     runs: tuple[Path, ...],
     model: str,
-    means: Means | None,
+    outlier_method: OutlierMethod | None,
     noise_files: tuple[str, ...],
     sort: bool,
     output: Path,
@@ -200,7 +200,7 @@ def estimate(
             "got --online and times to estimate at, expected one of them: causal estimates are at the"
             " samples of the IMU; leave one out, or use a jaxekf.Stream"
         )
-    chosen = get_model(model) if means is None else robust(model, means)
+    chosen = get_model(model) if outlier_method is None else robust(model, outlier_method)
     params = parameters.load(chosen, *noise_files)
     recordings = load_runs(runs, sort=sort, model=chosen)
     if isinstance(requested, list):

@@ -21,7 +21,7 @@ from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import estimate_many
 from jaxekf.estimation.result import Estimate
 from jaxekf.models import get_model
-from jaxekf.models.robust import Means, robust
+from jaxekf.models.robust import OutlierMethod, robust
 from jaxekf.recordings.types import Recording
 from jaxekf.reporting import plots
 
@@ -66,7 +66,7 @@ def plot(
     runs: tuple[Path, ...],
     figures: tuple[str, ...],
     model: str,
-    means: Means | None,
+    outlier_method: OutlierMethod | None,
     noise_files: tuple[str, ...],
     sort: bool,
     output: Path,
@@ -78,7 +78,7 @@ def plot(
     accelerometer. occlusion: the longest time without a pose. path: in three dimensions. visibility and
     innovations: of single markers.
     """
-    chosen = get_model(model) if means is None else robust(model, means)
+    chosen = get_model(model) if outlier_method is None else robust(model, outlier_method)
     recordings = load_runs(runs, sort=sort, model=chosen)
     estimates = estimate_many(recordings, chosen, parameters.load(chosen, *noise_files))
     files: list[Path] = []

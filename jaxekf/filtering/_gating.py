@@ -1,4 +1,8 @@
-"""What is done with samples that do not fit: chi-square gates, and weights for heavy tails, on lanes."""
+"""Outliers, on the batch axis: chi-square gates and robust weights (Huber, Student-t) for groups of rows.
+
+`jaxekf.filtering._step.linearise_and_gate` calls `gate_and_weight`. A new kind of weight goes into
+`noise_inflation`.
+"""
 
 from typing import Any, NamedTuple
 
@@ -8,300 +12,349 @@ import numpy as np
 from jax import Array, lax
 
 from jaxekf._support import chi_square
-from jaxekf.filtering import _covariance_algebra as covariance_algebra
+from jaxekf.filtering import _covariance_update as covariance_update
 from jaxekf.filtering import _repeated_groups as repeated_groups
-from jaxekf.filtering._lowered_model import System
-from jaxekf.filtering.lowering.lanes import written_sum
+from jaxekf.filtering._covariance_update import MeasurementRows
+from jaxekf.filtering._lowered_model import LoweredModel
+from jaxekf.filtering.lowering.lanes import unrolled_sum
 from jaxekf.filtering.lowering.structured_matrix import Pattern
 from jaxekf.filtering.model import Sensor
 from jaxekf.filtering.steps import Rows
 from jaxekf.geometry import linalg
 
-_HUBER = 0.95
-"""Share of honest samples that Huber's weight leaves alone."""
-_REACH = 7.0
-"""Of the belief that is widened: points are let in whose squared error is so many times larger than that of
-all in the mean, which of honest ones one in a thousand is."""
-_STUDENT = 4.0
-"""Degrees of freedom of Student's law: its tails are heavy, its variance is finite."""
+_HUBER_PROBABILITY = 0.95
+"""Probability with which a Gaussian group keeps its full weight under Huber's law."""
+_STUDENT_DOF = 4.0
+"""Degrees of freedom of Student's t: heavy tails, finite variance."""
+_REOPENED_RATIO = 7.0
+"""After a gate reset, groups of a repeated sensor are accepted up to this multiple of the mean normalised
+squared error. One Gaussian group in a thousand exceeds it."""
 
 
-class Linear(NamedTuple):
-    """One sensor linearised: rows, and the pattern of their slope."""
+class LinearisedRows(NamedTuple):
+    """One sensor linearised at one instant."""
 
-    slope: Pattern
-    rows: covariance_algebra.Rows
+    pattern: Pattern
+    """Sparsity of H."""
+    rows: MeasurementRows
 
 
-class Judged(NamedTuple):
-    """What gates and weights make of the samples of one instant."""
+class GatingResult(NamedTuple):
+    """The samples of one instant after gates and weights."""
 
-    linear: dict[str, Linear]
-    """What is left: refused rows hidden, noise of what counts less made larger."""
+    linear: dict[str, LinearisedRows]
+    """By sensor: gated rows hidden, noise of down-weighted rows inflated."""
     gated: dict[str, Array]
-    """By sensor: (rows, lanes) visible rows that were refused."""
+    """By sensor: (rows, lanes) visible rows that a gate rejected."""
     refused: Array | None
-    """(lanes,) as in `Track`; None without gates, as the others."""
+    """(lanes,) as in `FilterCarry`; None without gates, as the next two."""
     recovered: Array | None
-    widened: Array | None
-    """(lanes,) what the predicted covariance is multiplied by."""
+    """(lanes,) where the gates were reset."""
+    inflation: Array | None
+    """(lanes,) factor on the predicted covariance: above 1 where the gates were reset."""
 
 
-class _Group(NamedTuple):
-    """Rows that are judged together, and their squared distance from what is predicted."""
+class _GroupDistance(NamedTuple):
+    """One group of rows and its squared Mahalanobis distance from the prediction."""
 
     members: tuple[int, ...]
+    """Row numbers."""
+    visible: Array
+    """(lanes,) number of visible rows."""
+    distance: Array
+    """(lanes,) ``e' S^-1 e`` of the visible rows."""
+
+
+class _RepeatedDistances(NamedTuple):
+    """The same for every group of a sensor with repeated groups, (groups, lanes)."""
+
     visible: Array
     distance: Array
 
 
-class _Distance(NamedTuple):
-    """The same of each of many like groups, (groups, lanes)."""
-
-    visible: Array
-    distance: Array
+_Distances = list[_GroupDistance] | _RepeatedDistances
 
 
-def judge(
-    system: System,
-    seen: dict[str, Linear],
+def gate_and_weight(
+    lowered: LoweredModel,
+    linear: dict[str, LinearisedRows],
     samples: dict[str, Rows],
-    prior: Array,
+    prior_cov: Array,
     refused: Array | None,
-) -> Judged:
-    """Rows that are kept out or count less, and the way back for a belief that keeps everything out.
+) -> GatingResult:
+    """Reject rows by gates, inflate the noise of others by weights, and reset gates that reject everything.
 
-    Where gates have let nothing in while they refused samples for longer than the model's patience, it
-    is the belief that is wrong: the gates open once, and the covariance is multiplied by how many
-    times larger than expected the squared errors are. All samples then count in full.
+    Where gates have accepted nothing and rejected samples for longer than `Model.gate_reset_after_s`, the
+    belief is taken to be wrong: the gates open once, and the predicted covariance is multiplied by the
+    ratio of squared error to expected squared error. All samples then have full weight.
+
+    Parameters
+    ----------
+    lowered
+        The model.
+    linear
+        The sensors of this instant, linearised at the prediction.
+    samples
+        The same sensors' samples.
+    prior_cov
+        Predicted covariance, (n, n, lanes).
+    refused
+        (lanes,) as in `FilterCarry`.
     """
-    sensors = {name: system.measurements[name].sensor for name in seen}
-    groups = {
-        name: _groups(sensors[name], linear, prior)
-        for name, linear in seen.items()
+    sensors = {name: lowered.sensors[name].sensor for name in linear}
+    distances = {
+        name: _innovation_distances(sensors[name], one, prior_cov)
+        for name, one in linear.items()
         if sensors[name].gate is not None or sensors[name].weighting is not None
     }
-    gated, after, recovered, widened = _gates(system, seen, samples, prior, refused, groups)
-    linear = {name: _without(one, gated[name]) for name, one in seen.items()}
-    for name in groups:
+    gated, after, recovered, inflation = _apply_gates(
+        lowered, linear, samples, prior_cov, refused, distances
+    )
+    kept = {name: _hide_rows(one, gated[name]) for name, one in linear.items()}
+    for name in distances:
         if sensors[name].weighting is None:
             continue
-        larger = _lessening(sensors[name], groups[name], linear[name].rows.mask.shape[-2])
+        factor = _row_inflation(sensors[name], distances[name], kept[name].rows.mask.shape[-2])
         if recovered is not None:
-            larger = jnp.where(recovered, 1.0, larger)
-        linear[name] = _weighted(linear[name], larger)
-    return Judged(linear, gated, after, recovered, widened)
+            factor = jnp.where(recovered, 1.0, factor)
+        kept[name] = _inflate_noise(kept[name], factor)
+    return GatingResult(kept, gated, after, recovered, inflation)
 
 
-def weights(sensor: Sensor, residual: Array, cov: Array, mask: Array) -> Array | None:
-    """How much each row of a sample counts, (rows,): what the filter divided its noise by; None for a
-    sensor without weighting. `cov` is the innovation's, hidden rows as in the identity."""
+# --- weights ------------------------------------------------------------------------------------------
+
+
+def row_weights(sensor: Sensor, residual: Array, cov: Array, mask: Array) -> Array | None:
+    """Weight of each row of a sample, (m,): the filter divided the row's noise by it.
+
+    None for a sensor without weighting. `cov` is the innovation covariance (m, m), hidden rows as in the
+    identity.
+    """
     if sensor.weighting is None:
         return None
-    groups = _distances(sensor, jnp.where(mask, residual, 0.0), cov, mask)
-    return 1.0 / lessening(sensor, groups, residual.shape[0])
+    groups = _squared_distances(sensor, jnp.where(mask, residual, 0.0), cov, mask)
+    return 1.0 / noise_inflation(sensor, groups, residual.shape[0])
 
 
-def lessening(sensor: Sensor, groups: list[_Group], rows: int) -> Array:
-    """What the noise of each row is multiplied by, (rows, ...), at least 1.
+def noise_inflation(sensor: Sensor, groups: list[_GroupDistance], rows: int) -> Array:
+    """Factor on the noise of each row, (rows, lanes), at least 1.
 
-    With the squared distance d2 of a group of m visible rows: ``sqrt(d2 / c)`` beyond the quantile c of
-    chi-square (Huber), ``(v + d2) / (v + m)`` (Student, v degrees of freedom).
+    For a group of m visible rows with squared distance d2: ``sqrt(d2 / c)`` beyond the chi-square quantile
+    c (Huber), ``(v + d2) / (v + m)`` with v degrees of freedom (Student).
     """
     found: list[Any] = [None] * rows
     for members, visible, distance in groups:
         if sensor.weighting == "student":
-            larger = jnp.maximum((_STUDENT + distance) / (_STUDENT + visible), 1.0)
+            factor = jnp.maximum((_STUDENT_DOF + distance) / (_STUDENT_DOF + visible), 1.0)
         else:
-            bound = _bound(_HUBER, members, visible, distance)
-            larger = jnp.sqrt(jnp.maximum(distance / bound, 1.0))
+            bound = _chi_square_bound(_HUBER_PROBABILITY, members, visible, distance)
+            factor = jnp.sqrt(jnp.maximum(distance / bound, 1.0))
         for row in members:
-            found[row] = larger
+            found[row] = factor
     return jnp.stack(found)
 
 
-def _lessening(sensor: Sensor, groups: Any, rows: int) -> Array:
-    if not isinstance(groups, _Distance):
-        return lessening(sensor, groups, rows)
-    one = _alone(sensor)
-    return jax.vmap(lambda each: lessening(one, [_Group(tuple(range(rows)), *each)], rows))(groups)
+def _row_inflation(sensor: Sensor, distances: _Distances, rows: int) -> Array:
+    """`noise_inflation` of any sensor; (groups, rows, lanes) with repeated groups."""
+    if not isinstance(distances, _RepeatedDistances):
+        return noise_inflation(sensor, distances, rows)
+    single, members = _single_group(sensor), tuple(range(rows))
+    return jax.vmap(lambda each: noise_inflation(single, [_GroupDistance(members, *each)], rows))(
+        distances
+    )
 
 
-def _alone(sensor: Sensor) -> Sensor:
-    """One of the like groups of a sensor."""
-    assert sensor.alike is not None
-    return sensor.alike
-
-
-def _bound(share: Any, members: tuple[int, ...], visible: Array, like: Array) -> Array:
-    """Which a `share` of honest squared distances of as many visible rows does not exceed; where none is
-    visible, that of one."""
-    bounds = chi_square.ppf(share, np.arange(1, len(members) + 1))
-    found = jnp.full_like(like, bounds[0])
-    for count in range(2, len(bounds) + 1):
-        found = jnp.where(visible == count, bounds[count - 1], found)
-    return found
-
-
-def _weighted(linear: Linear, larger: Array) -> Linear:
-    if repeated_groups.are_many(linear.rows.mask):
-        noise = jax.vmap(_enlarged)(linear.rows.noise, larger)
+def _inflate_noise(linear: LinearisedRows, factor: Array) -> LinearisedRows:
+    if repeated_groups.has_group_axis(linear.rows.mask):
+        noise = jax.vmap(_inflated)(linear.rows.noise, factor)
     else:
-        noise = _enlarged(linear.rows.noise, larger)
+        noise = _inflated(linear.rows.noise, factor)
     return linear._replace(rows=linear.rows._replace(noise=noise))
 
 
-def _enlarged(noise: Array, larger: Array) -> Array:
-    if noise.ndim == larger.ndim:
-        return noise * larger
-    root = jnp.sqrt(larger)
+def _inflated(noise: Array, factor: Array) -> Array:
+    """Variances (m, lanes), or a covariance (m, m, lanes), with each row's factor (m, lanes)."""
+    if noise.ndim == factor.ndim:
+        return noise * factor
+    root = jnp.sqrt(factor)
     return noise * root[:, None] * root[None]
 
 
-def _without(linear: Linear, gated: Array) -> Linear:
+# --- gates --------------------------------------------------------------------------------------------
+
+
+def _hide_rows(linear: LinearisedRows, gated: Array) -> LinearisedRows:
     return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
 
 
-def _gates(
-    system: System,
-    seen: dict[str, Linear],
+def _apply_gates(
+    lowered: LoweredModel,
+    linear: dict[str, LinearisedRows],
     samples: dict[str, Rows],
-    prior: Array,
+    prior_cov: Array,
     refused: Array | None,
-    groups: dict[str, Any],
+    distances: dict[str, _Distances],
 ) -> tuple[dict[str, Array], Array | None, Array | None, Array | None]:
-    """Rows refused, seconds of refusing, where the gates were opened, and by how much to widen."""
-    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in seen.items()}
-    watched = [n for n in seen if system.measurements[n].sensor.gate is not None]
-    none = jnp.zeros(prior.shape[-1], bool)
+    """`gated`, `refused`, `recovered` and `inflation` of `GatingResult`."""
+    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in linear.items()}
+    with_gate = [n for n in linear if lowered.sensors[n].sensor.gate is not None]
+    none = jnp.zeros(prior_cov.shape[-1], bool)
     if refused is None:
         return gated, None, None, None
-    if not watched:
+    if not with_gate:
         return gated, refused, none, None
     ratios = {}
-    tally = _Tally(none, none, jnp.zeros_like(refused), jnp.ones_like(refused))
-    for name in watched:
-        given = (seen[name].rows.mask, groups[name], samples[name].dt)
-        tally, gated[name], ratios[name] = _counted(system.measurements[name].sensor, tally, *given)
-    let_in, kept_out, refused_s, excess = tally
-    after = jnp.where(let_in, 0.0, refused + refused_s)
-    # Earlier samples must have used up the patience: a single one is refused whatever its period.
-    recovered = kept_out & ~let_in & (refused > system.model.patience_s)
-    for n in watched:
-        known = ratios[n] < jnp.inf
-        if isinstance(groups[n], _Distance):
-            # Most points of an image are honest and the others far off, also from a belief so widened.
-            known &= ratios[n] <= _REACH * jnp.broadcast_to(excess, known.shape)
-        gated[n] &= ~(known & jnp.broadcast_to(recovered, known.shape))
-    widened = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
-    return gated, jnp.where(recovered, 0.0, after), recovered, widened
+    tally = _GateTally(none, none, jnp.zeros_like(refused), jnp.ones_like(refused))
+    for name in with_gate:
+        own = (linear[name].rows.mask, distances[name], samples[name].dt)
+        tally, gated[name], ratios[name] = _gate_sensor(lowered.sensors[name].sensor, tally, *own)
+    accepted, rejected, rejected_s, excess = tally
+    after = jnp.where(accepted, 0.0, refused + rejected_s)
+    # Earlier samples must have filled the time: a single one is rejected whatever its period.
+    recovered = rejected & ~accepted & (refused > lowered.model.gate_reset_after_s)
+    for n in with_gate:
+        reopened = ratios[n] < jnp.inf
+        if isinstance(distances[n], _RepeatedDistances):
+            # Most points of an image are good and the others far off, also from a belief so widened.
+            reopened &= ratios[n] <= _REOPENED_RATIO * jnp.broadcast_to(excess, reopened.shape)
+        gated[n] &= ~(reopened & jnp.broadcast_to(recovered, reopened.shape))
+    inflation = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
+    return gated, jnp.where(recovered, 0.0, after), recovered, inflation
 
 
-class _Tally(NamedTuple):
-    """What the gates did at one instant, each (lanes,)."""
+class _GateTally(NamedTuple):
+    """Summary of the gates of all sensors at one instant, each (lanes,)."""
 
-    let_in: Array
-    kept_out: Array
-    refused_s: Array
-    """The longest sampling period of what was refused."""
+    accepted: Array
+    rejected: Array
+    rejected_s: Array
+    """The longest sampling period of the rejected samples."""
     excess: Array
-    """How many times larger than expected the squared error of it is at most; of many like groups in the
-    geometric mean, in which a few that are far off count little."""
+    """The largest ratio of squared error to expected squared error among rejected groups; for repeated
+    groups their geometric mean, in which a few that are far off count little."""
 
 
-def _counted(
-    sensor: Sensor, tally: _Tally, mask: Array, groups: Any, dt: Array
-) -> tuple[_Tally, Array, Array]:
-    """The tally with one more sensor, its rows that were refused, and for each row how many times larger
-    than expected its group's squared error is."""
-    if isinstance(groups, _Distance):
-        return _counted_many(_alone(sensor), tally, mask, groups, dt)
-    let_in, kept_out, refused_s, excess = tally
-    gated, ratio = _gate(sensor, mask, groups)
+def _gate_sensor(
+    sensor: Sensor, tally: _GateTally, mask: Array, distances: _Distances, dt: Array
+) -> tuple[_GateTally, Array, Array]:
+    """The tally with one more sensor, its rejected rows, and for each row its group's ratio of squared
+    error to expected squared error."""
+    if isinstance(distances, _RepeatedDistances):
+        return _gate_repeated_sensor(_single_group(sensor), tally, mask, distances, dt)
+    accepted, rejected, rejected_s, excess = tally
+    gated, ratio = _gate_rows(sensor, mask, distances)
     finite = gated & (jnp.stack(ratio) < jnp.inf)
     for row in range(mask.shape[0]):
-        let_in = let_in | (mask[row] & ~gated[row])
-        kept_out = kept_out | finite[row]
+        accepted = accepted | (mask[row] & ~gated[row])
+        rejected = rejected | finite[row]
         excess = jnp.where(finite[row], jnp.maximum(excess, ratio[row]), excess)
-        refused_s = jnp.where(finite[row], jnp.maximum(refused_s, dt), refused_s)
-    return _Tally(let_in, kept_out, refused_s, excess), gated, jnp.stack(ratio)
+        rejected_s = jnp.where(finite[row], jnp.maximum(rejected_s, dt), rejected_s)
+    return _GateTally(accepted, rejected, rejected_s, excess), gated, jnp.stack(ratio)
 
 
-def _counted_many(
-    sensor: Sensor, tally: _Tally, mask: Array, groups: _Distance, dt: Array
-) -> tuple[_Tally, Array, Array]:
-    """The same with a sensor of many like groups, `sensor` being one of them.
+def _gate_repeated_sensor(
+    single: Sensor, tally: _GateTally, mask: Array, distances: _RepeatedDistances, dt: Array
+) -> tuple[_GateTally, Array, Array]:
+    """`_gate_sensor` of a sensor with repeated groups, `single` being one of them as a sensor.
 
-    It has let something in where it let in most of what it saw: by chance a few points always fit.
+    The sensor counts as accepted if most of its visible groups were: a few points fit by chance.
     """
     rows = tuple(range(mask.shape[1]))
     zero = jnp.zeros_like(dt)
 
     def one(carry: tuple[Array, Array, Array, Array], at: Any) -> tuple[Any, Any]:
-        balance, kept_out, number, logs = carry
+        balance, rejected, number, logs = carry
         mask, each = at
-        gated, ratio = _gate(sensor, mask, [_Group(rows, *each)])
-        refused, seen = gated[0], mask[0]
+        gated, ratio = _gate_rows(single, mask, [_GroupDistance(rows, *each)])
+        group_gated, visible = gated[0], mask[0]
         for row in rows[1:]:
-            refused, seen = refused | gated[row], seen | mask[row]
-        known = refused & (ratio[0] < jnp.inf)
-        balance = balance + jnp.where(refused, -1.0, jnp.where(seen, 1.0, 0.0))
-        log = jnp.log(jnp.where(known, jnp.maximum(ratio[0], 1.0), 1.0))
-        carry = (balance, kept_out | known, number + known.astype(dt.dtype), logs + log)
+            group_gated, visible = group_gated | gated[row], visible | mask[row]
+        finite = group_gated & (ratio[0] < jnp.inf)
+        balance = balance + jnp.where(group_gated, -1.0, jnp.where(visible, 1.0, 0.0))
+        log = jnp.log(jnp.where(finite, jnp.maximum(ratio[0], 1.0), 1.0))
+        carry = (balance, rejected | finite, number + finite.astype(dt.dtype), logs + log)
         return carry, (gated, jnp.stack(ratio))
 
     begin = (zero, jnp.zeros(dt.shape, bool), zero, zero)
-    (balance, refused, number, logs), (gated, ratio) = lax.scan(one, begin, (mask, groups))
+    (balance, rejected, number, logs), (gated, ratio) = lax.scan(one, begin, (mask, distances))
     larger = jnp.maximum(tally.excess, jnp.exp(logs / jnp.maximum(number, 1.0)))
     return (
-        _Tally(
-            tally.let_in | (balance > 0.0),
-            tally.kept_out | refused,
-            jnp.where(refused, jnp.maximum(tally.refused_s, dt), tally.refused_s),
-            jnp.where(refused, larger, tally.excess),
+        _GateTally(
+            tally.accepted | (balance > 0.0),
+            tally.rejected | rejected,
+            jnp.where(rejected, jnp.maximum(tally.rejected_s, dt), tally.rejected_s),
+            jnp.where(rejected, larger, tally.excess),
         ),
         gated,
         lax.stop_gradient(ratio),
     )
 
 
-def _groups(sensor: Sensor, linear: Linear, prior: Array) -> Any:
-    """Distances of the groups of a sensor: `_Group` of each, or `_Distance` of many like ones."""
-    if repeated_groups.are_many(linear.rows.mask):
-
-        def one(_: None, rows: covariance_algebra.Rows) -> tuple[None, Any]:
-            (found,) = _groups(_alone(sensor), linear._replace(rows=rows), prior)
-            return None, _Distance(found.visible, found.distance)
-
-        return lax.scan(one, None, linear.rows)[1]
-    rows = linear.rows
-    # What is differentiated by closed forms counts on symmetric cotangents of covariances.
-    cov = linalg.symmetrise(
-        covariance_algebra.innovation_covariance(linear.slope, rows.slope, rows.noise, prior)
-    )
-    return _distances(sensor, rows.residual, linalg.mask_covariance(cov, rows.mask), rows.mask)
-
-
-def _distances(sensor: Sensor, residual: Array, cov: Array, mask: Array) -> list[_Group]:
-    found = []
-    for members in sensor.group_rows:
-        part = jnp.stack([residual[i] for i in members])
-        shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
-        visible = written_sum([mask[i].astype(int) for i in members])
-        found.append(_Group(members, visible, linalg.squared_distance(part, shared)))
-    return found
-
-
-def _gate(sensor: Sensor, mask: Array, groups: list[_Group]) -> tuple[Array, list[Array]]:
-    """Visible rows whose group lies outside its chi-square bound; and for each row how many times
-    larger than expected its group's squared error is."""
+def _gate_rows(
+    sensor: Sensor, mask: Array, groups: list[_GroupDistance]
+) -> tuple[Array, list[Array]]:
+    """Visible rows (m, lanes) whose group is outside its chi-square bound, and for each row its group's
+    ratio of squared error to expected squared error, (lanes,)."""
     outside: list[Any] = [None] * sensor.rows
     ratios: list[Any] = [None] * sensor.rows
     for members, visible, distance in groups:
-        bound = _bound(sensor.gate, members, visible, distance)
+        bound = _chi_square_bound(sensor.gate, members, visible, distance)
         # A distance that is NaN is outside too: such a row must not enter the update.
         rejected = jnp.logical_not(distance <= bound)
         ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)
         for row in members:
             outside[row], ratios[row] = rejected, lax.stop_gradient(ratio)
     return lax.stop_gradient(jnp.stack(outside) & mask), ratios
+
+
+def _chi_square_bound(
+    probability: Any, members: tuple[int, ...], visible: Array, like: Array
+) -> Array:
+    """Chi-square quantile for the number of visible rows (at least one), in the shape of `like`."""
+    bounds = chi_square.ppf(probability, np.arange(1, len(members) + 1))
+    found = jnp.full_like(like, bounds[0])
+    for count in range(2, len(bounds) + 1):
+        found = jnp.where(visible == count, bounds[count - 1], found)
+    return found
+
+
+# --- distances ----------------------------------------------------------------------------------------
+
+
+def _innovation_distances(sensor: Sensor, linear: LinearisedRows, prior_cov: Array) -> _Distances:
+    """Squared distances of the groups of a sensor from the prediction."""
+    if repeated_groups.has_group_axis(linear.rows.mask):
+
+        def one(_: None, rows: MeasurementRows) -> tuple[None, Any]:
+            own = linear._replace(rows=rows)
+            found: Any = _innovation_distances(_single_group(sensor), own, prior_cov)
+            return None, _RepeatedDistances(found[0].visible, found[0].distance)
+
+        return lax.scan(one, None, linear.rows)[1]
+    rows = linear.rows
+    # The closed-form derivatives of the filter need symmetric cotangents of covariances.
+    cov = linalg.symmetrise(
+        covariance_update.innovation_covariance(
+            linear.pattern, rows.jacobian, rows.noise, prior_cov
+        )
+    )
+    masked = linalg.mask_covariance(cov, rows.mask)
+    return _squared_distances(sensor, rows.residual, masked, rows.mask)
+
+
+def _squared_distances(
+    sensor: Sensor, residual: Array, cov: Array, mask: Array
+) -> list[_GroupDistance]:
+    found = []
+    for members in sensor.group_rows:
+        part = jnp.stack([residual[i] for i in members])
+        shared = jnp.stack([jnp.stack([cov[i, j] for j in members]) for i in members])
+        visible = unrolled_sum([mask[i].astype(int) for i in members])
+        found.append(_GroupDistance(members, visible, linalg.squared_distance(part, shared)))
+    return found
+
+
+def _single_group(sensor: Sensor) -> Sensor:
+    """One of the repeated groups of a sensor, as a sensor."""
+    assert sensor.alike is not None
+    return sensor.alike

@@ -1,9 +1,11 @@
-"""The update linearised again about what it found, the prediction's covariance being the prior throughout.
+"""The iterated update: linearised again about its result, with the prediction's covariance as the prior.
 
-Iterated extended Kalman filter: Gauss-Newton for the most probable state given the prediction and the
+Iterated extended Kalman filter, or Gauss-Newton for the most probable state given the prediction and the
 samples of one instant,
 
     |local(x_predicted, x)|^2 / P + sum |local(h(x), z)|^2 / R
+
+`jaxekf.filtering._step.update` calls it where `relinearise` is above 0.
 """
 
 from dataclasses import replace
@@ -14,97 +16,94 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxekf.filtering import _covariance_algebra as covariance_algebra
-from jaxekf.filtering._covariance_algebra import Gained
-from jaxekf.filtering._gating import Linear
-from jaxekf.filtering._lowered_model import System
-from jaxekf.filtering._lowered_path import AboutSystem
-from jaxekf.filtering._step import any_used, hide, take_block
-from jaxekf.filtering.lowering.lanes import stage
+from jaxekf.filtering._covariance_update import UpdateAccumulator
+from jaxekf.filtering._gating import LinearisedRows
+from jaxekf.filtering._lowered_model import BoundModel, LoweredModel
+from jaxekf.filtering._step import any_used, apply_sensor, mask_rows
+from jaxekf.filtering.lowering.batched_products import congruence, multiply_vector
+from jaxekf.filtering.lowering.lanes import materialise
 from jaxekf.filtering.model import Belief
-from jaxekf.geometry import linalg
 
 
-class Again:
-    """So many further linearisations, each about where the one before arrived."""
+class IteratedUpdate:
+    """Further linearisations of an update, each about the result of the one before.
 
-    def __init__(self, system: AboutSystem, times: int) -> None:
-        self._system, self._times = system, times
+    Parameters
+    ----------
+    lowered
+        The model, linearised about a path (`ABOUT_PATH`).
+    times
+        Number of further linearisations.
+    """
 
-    def prepare(self, params: Any) -> Any:
-        """What it needs of the parameters, for one run."""
-        return self._system.prepare(params)
+    def __init__(self, lowered: LoweredModel, times: int) -> None:
+        self.lowered, self._times = lowered, times
 
     def __call__(
         self,
-        prepared: Any,
+        bound: BoundModel,
         prior: Belief,
-        found: Belief,
+        posterior: Belief,
         u: Any,
         samples: Any,
-        linear: dict[str, Linear],
-        *,
-        adjoint: bool,
+        linear: dict[str, LinearisedRows],
     ) -> tuple[Belief, Array]:
-        """The posterior, from the one `found` at first, and the smallest pivot; on lanes.
+        """The posterior after all linearisations, and the smallest pivot (lanes,).
 
-        `linear` tells which rows count and with what noise.
+        Parameters
+        ----------
+        bound
+            `lowered` with the parameters.
+        prior, posterior
+            The prediction, and the result of the first update.
+        u, samples
+            The inputs of the update.
+        linear
+            The first linearisation: its masks and its noise, after gates and weights, hold throughout.
         """
         lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
-        posterior, smallest = found, jnp.ones(lanes, dtype)
+        first, smallest = posterior, jnp.ones(lanes, dtype)
         for _ in range(self._times):
             x = posterior.mean
-            away, changed = self._system.start(prepared["start"], prior.mean, x, adjoint=adjoint)
-            before = Gained(
-                turned(changed, prior.cov),
-                -stage(covariance_algebra.apply(changed, away)),
+            error, jacobian = bound.prior(prior.mean, x)
+            accumulator = UpdateAccumulator(
+                congruence(jacobian, prior.cov),
+                -materialise(multiply_vector(jacobian, error)),
                 jnp.zeros(lanes, dtype),
             )
-            rows = self._looked(prepared, x, u, samples, linear, adjoint)
-            for one in rows.values():
-                before, pivot = take_block(one.slope, before, one.rows, adjoint)
+            for one in self._linearise(bound, x, u, samples, linear):
+                accumulator, pivot = apply_sensor(one, accumulator, adjoint=bound.adjoint)
                 smallest = jnp.minimum(smallest, pivot)
-            moved, reset = self._system.move(prepared["move"], x, before.delta, adjoint=adjoint)
-            posterior = Belief(moved, turned(reset, before.cov))
+            mean, reset = bound.retraction(x, accumulator.delta)
+            posterior = Belief(mean, congruence(reset, accumulator.cov))
         used = any_used(linear)
-        return _where(used, posterior, found), jnp.where(used, smallest, 1.0)
+        return _where(used, posterior, first), jnp.where(used, smallest, 1.0)
 
-    def _looked(
-        self, prepared: Any, x: Any, u: Any, samples: Any, linear: dict[str, Linear], adjoint: bool
-    ) -> dict[str, Linear]:
-        """Residuals and slopes at x, with the masks and the noise of the first look."""
-        rows = {}
+    def _linearise(
+        self, bound: BoundModel, x: Any, u: Any, samples: Any, linear: dict[str, LinearisedRows]
+    ) -> list[LinearisedRows]:
+        """Residuals and Jacobians at x, with the masks and the noise of the first linearisation."""
+        found = []
         for name, sample in samples.items():
-            measurement = self._system.measurements[name]
-            constants = prepared[f"sensor {name}"]
-            residual, slope, _ = measurement(constants, x, u, sample, adjoint=adjoint)
-            first = linear[name].rows
-            rows[name] = hide(measurement, residual, slope, first.noise, first.mask)
-        return rows
+            residual, jacobian, _ = bound.sensor(name, x, u, sample)
+            first, sensor = linear[name].rows, self.lowered.sensors[name]
+            found.append(mask_rows(sensor, residual, jacobian, first.noise, first.mask))
+        return found
 
 
 @lru_cache(maxsize=64)
-def again(system: AboutSystem, times: int) -> Again:
-    """The same object for the same arguments."""
-    return Again(system, times)
-
-
-@lru_cache(maxsize=64)
-def with_again(ready: System, more: Again) -> System:
-    """The system that linearises again; the same object for the same arguments."""
-    return replace(ready, again=more)
+def with_iterated_update(
+    lowered: LoweredModel, about_path: LoweredModel, times: int
+) -> LoweredModel:
+    """The model with `times` further linearisations of every update; the same object for the same
+    arguments."""
+    return replace(lowered, iterated_update=IteratedUpdate(about_path, times))
 
 
 def _where(used: Array, a: Belief, b: Belief) -> Belief:
-    """One belief or the other, lane by lane."""
+    """One belief or the other, by lane."""
 
     def choose(a: Array, b: Array) -> Array:
         return jnp.where(used.reshape((1,) * (a.ndim - 1) + (-1,)), a, b)
 
     return Belief(jax.tree.map(choose, a.mean, b.mean), choose(a.cov, b.cov))
-
-
-def turned(matrix: Array, cov: Array) -> Array:
-    """``M P M'``."""
-    half = stage(covariance_algebra.product(matrix, cov))
-    return stage(linalg.symmetrise(covariance_algebra.product_transposed(half, matrix)))

@@ -1,10 +1,16 @@
-"""A model made ready for the filter: its functions on lanes, and the structure of its matrices.
+"""A model compiled for the filter: its functions on the batch axis, the sparsity of its matrices.
 
-All of it is found from the model's functions when a program is traced; a model declares nothing.
+`build` traces a model's functions and finds the sparsity of its Jacobians and covariances; a model
+declares nothing. Inside a scan `LoweredModel.bind` gives a `BoundModel`, whose methods evaluate the
+functions for a batch of runs, the last axis of every array being the batch axis (lanes).
+
+A `Linearisation` chooses the point of linearisation. The filter linearises at its own estimates
+(`AT_ESTIMATE`); the iterated smoother and the iterated update linearise everything about one given
+path (`ABOUT_PATH`), and need the derivatives of the residuals themselves.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -18,271 +24,248 @@ from jaxekf._support.errors import SlowModelWarning
 from jaxekf.filtering import _linearisation as linearisation
 from jaxekf.filtering import _repeated_groups as repeated_groups
 from jaxekf.filtering._linearisation import Jacobian
-from jaxekf.filtering.lowering import lanes, scalar_graph, sparsity, structured_matrix
-from jaxekf.filtering.lowering.scalar_graph import Program
+from jaxekf.filtering.lowering import scalar_graph, sparsity, structured_matrix
+from jaxekf.filtering.lowering.lowered_function import LoweredFunction
 from jaxekf.filtering.lowering.structured_matrix import Bands, Pattern
 from jaxekf.filtering.model import Model, Sensor
 from jaxekf.filtering.steps import Rows
 from jaxekf.geometry import manifold
 
 
-class Piece:
-    """A function of one run, split into what depends on the parameters only and what is done each step."""
+class Linearisation(NamedTuple):
+    """The point about which transitions and sensors are linearised, and how the state is corrected."""
 
-    def __init__(self, function: Callable[..., Any], params: Any, *rest: Any) -> None:
-        program = sparsity.simplified(scalar_graph.trace(function, params, *rest))
-        self._head, self._body = scalar_graph.split(program, len(jax.tree.leaves(params)))
-        self.unlisted = lanes.unlisted(self._body)
-        """Operations of a step that are not plain arithmetic."""
-        self._on_lanes = partial(_on_lanes, self._body)
-        self._pullback: Program | None = None
-        self._with_adjoint = jax.custom_vjp(self._on_lanes)
-        self._with_adjoint.defvjp(lambda *values: (self._on_lanes(*values), values), self._pull)
-
-    def prepare(self, params: Any) -> tuple[Array, ...]:
-        """What the steps need of the parameters, for one run; differentiable and cheap."""
-        return tuple(self._head.evaluate(jax.tree.leaves(params)))
-
-    def __call__(self, prepared: Any, *rest: Any, adjoint: bool = False) -> Any:
-        """The function on lanes; with `adjoint` its reverse derivative is one on lanes too."""
-        values = (*prepared, *jax.tree.leaves(rest))
-        found = (self._with_adjoint if adjoint else self._on_lanes)(*values)
-        return jax.tree.unflatten(self._body.tree, found)
-
-    def _pull(self, values: tuple[Any, ...], cotangents: Any) -> tuple[Any, ...]:
-        inexact = [jnp.issubdtype(spec.dtype, jnp.inexact) for spec in self._body.inputs]
-        if self._pullback is None:
-            self._pullback = _pullback(self._body, inexact)
-        found = iter(lanes.stage(lanes.evaluate(self._pullback, [*values, *cotangents])))
-        return tuple(
-            next(found) if flag else np.zeros(value.shape, jax.dtypes.float0)
-            for flag, value in zip(inexact, values, strict=True)
-        )
+    transition: Callable[..., linearisation.LinearTransition]
+    sensor: Callable[..., linearisation.LinearSensor]
+    is_about_path: bool
+    """Whether transitions get the state and the process noise at their end as further arguments."""
 
 
-def _on_lanes(body: Program, *values: Array) -> list[Array]:
-    return lanes.stage(jax.tree.leaves(lanes.evaluate(body, values)))
+AT_ESTIMATE = Linearisation(
+    linearisation.transition_at_estimate, linearisation.sensor_at_estimate, is_about_path=False
+)
+ABOUT_PATH = Linearisation(
+    linearisation.transition_about_path, linearisation.sensor_about_path, is_about_path=True
+)
 
 
-def _pullback(body: Program, inexact: list[bool]) -> Program:
-    """The program that turns values and cotangents of outputs into cotangents of inexact inputs."""
-    count = len(body.inputs)
+class LoweredTransition(NamedTuple):
+    """The transition, its Jacobians F and G and its process noise."""
 
-    def pull(*given: Any) -> list[Any]:
-        values, cotangents = given[:count], given[count:]
-
-        def function(*moving: Any) -> list[Any]:
-            moved = iter(moving)
-            full = [next(moved) if f else v for f, v in zip(inexact, values, strict=True)]
-            return jax.tree.leaves(body.evaluate(full))
-
-        moving = [v for f, v in zip(inexact, values, strict=True) if f]
-        return list(jax.vjp(function, *moving)[1](list(cotangents)))
-
-    outputs = jax.eval_shape(lambda *v: jax.tree.leaves(body.evaluate(v)), *body.inputs)
-    return sparsity.simplified(scalar_graph.trace(pull, *body.inputs, *outputs))
+    function: LoweredFunction
+    """``(params, x, u, dt)`` to the predicted mean and the bands of F and G; about a path
+    ``(params, x, after, w, u, dt)`` to the defect and the same bands."""
+    process_noise: LoweredFunction
+    """``(params, dt)`` to the covariance of the process noise, as a list of one."""
+    f_pattern: Pattern
+    g_pattern: Pattern
+    has_diagonal_noise: bool
+    """Whether the process noise is diagonal; then it is given as its variances."""
 
 
-class Transition(NamedTuple):
-    """The transition's mean, Jacobians and noise, and what is known of them."""
-
-    piece: Piece
-    """``(params, x, u, dt)`` to the mean and the unknown bands of F and G."""
-    sigma: Piece
-    """``(params, dt)`` to the process noise, as a list of one."""
-    state: Pattern
-    noise: Pattern
-    diagonal: bool
-    """Whether the noise is diagonal; then it is given as its variances."""
-
-
-class Measurement(NamedTuple):
-    """A sensor's residual, slope and noise, and what is known of them."""
+class LoweredSensor(NamedTuple):
+    """A sensor's residual, its Jacobian H and its noise R."""
 
     sensor: Sensor
-    piece: Piece
-    """``(params, x, u, rows)`` to the residual, the unknown bands of H, and the noise."""
-    slope: Pattern
-    diagonal: bool
-
-    def __call__(
-        self, constants: Any, x: Any, u: Any, rows: Rows, *, adjoint: bool
-    ) -> tuple[Array, Bands, Array]:
-        """Residual, unknown bands of the slope, and noise of a sample on lanes.
-
-        Of a sample that is made of like groups each of them has the groups on its first axis.
-        """
-        if self.sensor.alike is None:
-            return self.piece(constants, x, u, rows, adjoint=adjoint)
-        # One after the other: the derivative by what they share is then a sum, one term at a time.
-        groups = repeated_groups.apart(rows, self.sensor.copies)
-
-        def one(_: None, group: Any) -> tuple[None, Any]:
-            return None, self.piece(constants, x, u, rows._replace(**group), adjoint=adjoint)
-
-        return lax.scan(one, None, groups)[1]
-
-
-class Correction(NamedTuple):
-    """How an error vector moves the mean, and how the covariance follows."""
-
-    piece: Piece
-    """``(params, x, delta, any_used)`` to the mean, the unknown bands of the reset Jacobian, and how
-    far, as an error vector, the model's constraint moved the mean; None without one."""
-    reset: Pattern
+    function: LoweredFunction
+    """``(params, x, u, rows)`` to the residual, the bands of H, and R."""
+    pattern: Pattern
+    """Sparsity of H."""
+    has_diagonal_noise: bool
+    """Whether R is diagonal; then it is given as its variances."""
 
 
 @dataclass(frozen=True, eq=False)
-class System:
-    """A model made ready."""
+class LoweredModel:
+    """A model's functions on the batch axis. Build with `build`, use through `bind`."""
 
     model: Model
-    transition: Transition
-    measurements: dict[str, Measurement]
-    correction: Correction
-    again: Any = None
-    """What linearises updates again (`jaxekf.filtering._iterated_update.Again`); None where once is
-    enough."""
+    transition: LoweredTransition
+    sensors: dict[str, LoweredSensor]
+    corrections: dict[str, LoweredFunction]
+    """How an error vector moves the mean: "correction" at an estimate, "prior" and "retraction" about a
+    path; see the methods of `BoundModel` with these names."""
+    reset_pattern: Pattern
+    """Sparsity of the reset Jacobian (section 4 of docs/mathematics.md)."""
+    iterated_update: Any = None
+    """`jaxekf.filtering._iterated_update.IteratedUpdate`, which linearises updates again; None where every
+    update is linearised once."""
 
-    def prepare(self, params: Any) -> dict[str, tuple[Array, ...]]:
-        """What the steps need of the parameters, for one run."""
-        found = {f"sensor {name}": m.piece.prepare(params) for name, m in self.measurements.items()}
-        found["transition"] = self.transition.piece.prepare(params)
-        found["process noise"] = self.transition.sigma.prepare(params)
-        found["correction"] = self.correction.piece.prepare(params)
-        if self.again is not None:
-            found["again"] = self.again.prepare(params)
+    def prepare(self, params: Any) -> dict[str, Any]:
+        """Everything of the steps that depends on the parameters only, for one run."""
+        functions = {f"sensor {name}": sensor.function for name, sensor in self.sensors.items()}
+        functions["transition"] = self.transition.function
+        functions["process noise"] = self.transition.process_noise
+        functions |= self.corrections
+        found: dict[str, Any] = {name: f.prepare(params) for name, f in functions.items()}
+        if self.iterated_update is not None:
+            found["iterated update"] = self.iterated_update.lowered.prepare(params)
         return found
+
+    def bind(self, prepared: dict[str, Any], *, adjoint: bool) -> "BoundModel":
+        """The model with what `prepare` returned, runs on the last axis.
+
+        With `adjoint` reverse derivatives are those of the closed forms (docs/mathematics.md, sections 2
+        and 3) and of `LoweredFunction`; without, every derivative is JAX's own.
+        """
+        return BoundModel(self, prepared, adjoint)
 
     @property
     def is_gated(self) -> bool:
         """Whether any sensor has a gate."""
-        return any(m.sensor.gate is not None for m in self.measurements.values())
+        return any(lowered.sensor.gate is not None for lowered in self.sensors.values())
 
 
-def build(model: Model, params: Any, x: Any, u: Any, rows: dict[str, Any]) -> System:
-    """The system of a model for one sample of everything: arrays, or their shapes and types."""
-    return _build(model, *specified(params, x, u, rows))
+@dataclass(frozen=True, eq=False)
+class BoundModel:
+    """A lowered model with the parameters of a batch of runs; every array carries the lanes last."""
+
+    lowered: LoweredModel
+    prepared: dict[str, Any]
+    adjoint: bool
+    """Whether reverse derivatives are the closed forms."""
+
+    def _call(self, name: str, function: LoweredFunction, *args: Any) -> Any:
+        return function(self.prepared[name], *args, adjoint=self.adjoint)
+
+    def transition(self, *args: Any) -> tuple[Any, Bands, Bands]:
+        """Predicted mean (at an estimate) or defect (about a path), and the bands of F and G."""
+        return self._call("transition", self.lowered.transition.function, *args)
+
+    def process_noise(self, dt: Array) -> Array:
+        """Covariance (n_w, n_w, lanes) of the process noise, or its variances (n_w, lanes) if diagonal."""
+        (found,) = self._call("process noise", self.lowered.transition.process_noise, dt)
+        return found
+
+    def sensor(self, name: str, x: Any, u: Any, rows: Rows) -> tuple[Array, Bands, Array]:
+        """Residual (m, lanes), bands of H, and noise R of a sample.
+
+        The results of a sensor with repeated groups have the groups on a further, first axis.
+        """
+        sensor, function = self.lowered.sensors[name][:2]
+        call = partial(self._call, f"sensor {name}", function, x, u)
+        if sensor.alike is None:
+            return call(rows)
+        # A scan over the groups: cotangents of what they share are then summed one term at a time.
+        groups = repeated_groups.split_groups(rows, sensor.copies)
+
+        def one(_: None, group: Any) -> tuple[None, Any]:
+            return None, call(rows._replace(**group))
+
+        return lax.scan(one, None, groups)[1]
+
+    def correction(self, x: Any, delta: Array, used: Array) -> tuple[Any, Bands, Array | None]:
+        """The mean moved by the error vector `delta` (n, lanes) where `used` (lanes,).
+
+        Returns the mean, the bands of the reset Jacobian, and the error vector by which the model's
+        constraint (`Model.project`) moved the mean; None for a model without constraint.
+        """
+        return self._call("correction", self.lowered.corrections["correction"], x, delta, used)
+
+    def prior(self, first: Any, x: Any) -> tuple[Array, Array]:
+        """The error vector of `x` in the chart of `first`, and a Jacobian (n, n, lanes) that maps errors at
+        `first` to errors at `x`."""
+        return self._call("prior", self.lowered.corrections["prior"], first, x)
+
+    def retraction(self, x: Any, delta: Array) -> tuple[Any, Array]:
+        """`x` moved by `delta` (n, lanes), and the reset Jacobian (n, n, lanes)."""
+        return self._call("retraction", self.lowered.corrections["retraction"], x, delta)
+
+    def iterated_update(self) -> "BoundModel":
+        """The model of the iterated update, linearised about a path."""
+        lowered = self.lowered.iterated_update.lowered
+        return BoundModel(lowered, self.prepared["iterated update"], self.adjoint)
 
 
-def specified(*args: Any) -> tuple[Any, Any]:
-    """Shapes and types of the leaves of the arguments, and their structure; hashable."""
-    leaves, tree = jax.tree.flatten(args)
-    return tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves), tree
-
-
-@lru_cache(maxsize=64)
-def _build(model: Model, leaves: Any, tree: Any) -> System:
-    spec = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
-    params, x, u, rows = spec
-    measurements = {
-        name: measurement(model, model.sensor(name), params, x, u, sample)
-        for name, sample in rows.items()
-    }
-    return System(
-        model, _transition(model, params, x, u), measurements, _correction(model, params, x)
-    )
-
-
-def warn_of(model: Model, what: str, left: tuple[str, ...], piece: Piece) -> None:
-    """Tell, once, which operations of a model's function make it slow."""
-    if left:
-        warnings.warn(
-            SlowModelWarning(
-                f"model '{model.name}', {what}: a quaternion of the state goes through {', '.join(left)},"
-                " so that its derivative is taken by its four numbers, which is slower; use the functions"
-                " of jaxekf.geometry.rotation"
-            ),
-            stacklevel=2,
-        )
-    if piece.unlisted:
-        warnings.warn(
-            SlowModelWarning(
-                f"model '{model.name}', {what}: got the operations {', '.join(piece.unlisted)}, expected"
-                " arithmetic, small products and rearrangements; each run takes them by itself, which is"
-                " slower"
-            ),
-            stacklevel=2,
-        )
-
-
-def is_diagonal(matrix: sparsity.Known) -> bool:
-    return bool(np.all(matrix.is_zero() | np.eye(matrix.value.shape[0], dtype=bool)))
-
-
-def noise_of(function: Callable[..., Array], *spec: Any) -> tuple[Callable[..., Array], bool]:
-    """A function that makes a covariance, as one of variances where it is diagonal; and whether it is."""
-    diagonal = is_diagonal(sparsity.find(scalar_graph.trace(function, *spec)))
-    return (partial(linearisation.variances, function) if diagonal else function), diagonal
-
-
-def patterns_of(jacobians: Callable[..., Sequence[Jacobian]], *spec: Any) -> list[Pattern]:
-    """The patterns of the Jacobians that a function makes."""
-    dense = scalar_graph.trace(lambda *args: [one.dense() for one in jacobians(*args)], *spec)
-    return [structured_matrix.pattern(one) for one in sparsity.find(dense)]
-
-
-def both_jacobians(
-    found: linearisation.LinearTransition | linearisation.LinearBetween,
-) -> list[Jacobian]:
-    """F and G of a transition."""
-    return [found.f, found.g]
-
-
-def _transition(model: Model, params: Any, x: Any, u: Any) -> Transition:
-    dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
-    linearised = partial(linearisation.transition_blocks, model)
-    spec = (params, x, u, dt)
-    state, noise = patterns_of(lambda *args: both_jacobians(linearised(*args)), *spec)
-    left: list[tuple[str, ...]] = []
-
-    def step(*args: Any) -> Any:
-        found = linearised(*args)
-        left.append(found.left)
-        return found.mean, found.f.bands(state), found.g.bands(noise)
-
-    sigma, diagonal = noise_of(model.process_noise, params, dt)
-    piece = Piece(step, *spec)
-    warn_of(model, "transition", left[-1], piece)
-    density = Piece(lambda *args: [sigma(*args)], params, dt)
-    warn_of(model, "process_noise", (), density)
-    return Transition(piece, density, state, noise, diagonal)
-
-
-def measurement(
+def build(
     model: Model,
-    sensor: Sensor,
     params: Any,
     x: Any,
     u: Any,
-    rows: Any,
-    linearised: Callable[..., linearisation.LinearSample] = linearisation.sample_blocks,
-) -> Measurement:
-    one = sensor if sensor.alike is None else sensor.alike
+    rows: dict[str, Any],
+    linearise: Linearisation = AT_ESTIMATE,
+) -> LoweredModel:
+    """The lowered model for one sample of everything: arrays, or their shapes and types.
+
+    The same object for the same arguments. Warns with `SlowModelWarning` of functions that need more than
+    plain arithmetic.
+    """
+    leaves, tree = jax.tree.flatten((params, x, u, rows))
+    spec = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+    return _build(model, linearise, spec, tree)
+
+
+@lru_cache(maxsize=128)
+def _build(model: Model, linearise: Linearisation, leaves: Any, tree: Any) -> LoweredModel:
+    spec = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*leaf) for leaf in leaves])
+    params, x, u, rows = spec
+    sensors = {
+        name: _lower_sensor(model, model.sensor(name), linearise, params, x, u, sample)
+        for name, sample in rows.items()
+    }
+    transition = _lower_transition(model, linearise, params, x, u)
+    lower_corrections = _path_corrections if linearise.is_about_path else _estimate_correction
+    return LoweredModel(model, transition, sensors, *lower_corrections(model, params, x))
+
+
+def _lower_transition(
+    model: Model, linearise: Linearisation, params: Any, x: Any, u: Any
+) -> LoweredTransition:
+    dt = jax.ShapeDtypeStruct((), manifold.dtype_of(x))
+    linearised = partial(linearise.transition, model)
+    spec = (params, x, u, dt)
+    if linearise.is_about_path:
+        w = jax.ShapeDtypeStruct(
+            jax.eval_shape(model.process_noise, params, dt).shape[:1], dt.dtype
+        )
+        spec = (params, x, x, w, u, dt)
+    f_pattern, g_pattern = _find_patterns(lambda *args: linearised(*args)[1:3], *spec)
+    fallbacks: list[tuple[str, ...]] = []
+
+    def step(*args: Any) -> Any:
+        found = linearised(*args)
+        fallbacks.append(found.fallbacks)
+        return found.end, found.f.bands(f_pattern), found.g.bands(g_pattern)
+
+    noise, is_diagonal = _noise_function(model.process_noise, params, dt)
+    function = LoweredFunction(step, *spec)
+    process_noise = LoweredFunction(lambda *args: [noise(*args)], params, dt)
+    if not linearise.is_about_path:
+        _warn_if_slow(model, "transition", fallbacks[-1], function)
+        _warn_if_slow(model, "process_noise", (), process_noise)
+    return LoweredTransition(function, process_noise, f_pattern, g_pattern, is_diagonal)
+
+
+def _lower_sensor(
+    model: Model, sensor: Sensor, linearise: Linearisation, params: Any, x: Any, u: Any, rows: Any
+) -> LoweredSensor:
+    single = sensor if sensor.alike is None else sensor.alike
     if sensor.alike is not None:
-        rows = repeated_groups.one_of(rows, sensor.copies)
-    function = partial(linearised, model, one)
-    (slope,) = patterns_of(lambda *args: [function(*args).slope], params, x, u, rows)
-    noise, diagonal = noise_of(one.noise, params, rows.aux, rows.dt)
-    left: list[tuple[str, ...]] = []
+        rows = repeated_groups.single_group_spec(rows, sensor.copies)
+    linearised = partial(linearise.sensor, model, single)
+    (pattern,) = _find_patterns(lambda *args: [linearised(*args).jacobian], params, x, u, rows)
+    noise, is_diagonal = _noise_function(single.noise, params, rows.aux, rows.dt)
+    fallbacks: list[tuple[str, ...]] = []
 
     def sample(params: Any, x: Any, u: Any, rows: Any) -> Any:
-        found = function(params, x, u, rows)
-        left.append(found.left)
-        return found.residual, found.slope.bands(slope), noise(params, rows.aux, rows.dt)
+        found = linearised(params, x, u, rows)
+        fallbacks.append(found.fallbacks)
+        return found.residual, found.jacobian.bands(pattern), noise(params, rows.aux, rows.dt)
 
-    piece = Piece(sample, params, x, u, rows)
-    warn_of(model, f"sensor '{sensor.name}'", left[-1], piece)
-    return Measurement(sensor, piece, slope, diagonal)
+    function = LoweredFunction(sample, params, x, u, rows)
+    _warn_if_slow(model, f"sensor '{sensor.name}'", fallbacks[-1], function)
+    return LoweredSensor(sensor, function, pattern, is_diagonal)
 
 
-def _correction(model: Model, params: Any, x: Any) -> Correction:
+Corrections = tuple[dict[str, LoweredFunction], Pattern]
+
+
+def _estimate_correction(model: Model, params: Any, x: Any) -> Corrections:
     delta = jax.ShapeDtypeStruct((model.error_dim,), manifold.dtype_of(x))
     used = jax.ShapeDtypeStruct((), jnp.bool_)
-    known = sparsity.find(scalar_graph.trace(partial(manifold.reset_jacobian, model.space), delta))
-    reset = structured_matrix.pattern(known)
+    reset = _reset_pattern(model, delta)
 
-    def move(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
+    def correct(params: Any, x: Any, delta: Array, any_used: Array) -> Any:
         moved = manifold.retract(model.space, x, delta)
         mean, shift = moved, None
         if model.project is not None:
@@ -290,9 +273,78 @@ def _correction(model: Model, params: Any, x: Any) -> Correction:
             shift = manifold.local(model.space, moved, mean)
             shift = jnp.where(any_used, shift, 0.0)
         mean = manifold.copy_where(any_used, mean, x)
-        bands = structured_matrix.cut(manifold.reset_jacobian(model.space, delta), reset)
-        return mean, bands, shift
+        jacobian = manifold.reset_jacobian(model.space, delta)
+        return mean, structured_matrix.extract_bands(jacobian, reset), shift
 
-    piece = Piece(move, params, x, delta, used)
-    warn_of(model, "state space", (), piece)
-    return Correction(piece, reset)
+    function = LoweredFunction(correct, params, x, delta, used)
+    _warn_if_slow(model, "state space", (), function)
+    return {"correction": function}, reset
+
+
+def _path_corrections(model: Model, params: Any, x: Any) -> Corrections:
+    delta = jax.ShapeDtypeStruct((model.error_dim,), manifold.dtype_of(x))
+
+    def prior(params: Any, first: Any, x: Any) -> Any:
+        error = manifold.local(model.space, first, x)
+        return error, manifold.reset_jacobian(model.space, error)
+
+    def retraction(params: Any, x: Any, delta: Array) -> Any:
+        moved = manifold.retract(model.space, x, delta)
+        if model.project is not None:
+            moved = model.project(moved)
+        return moved, manifold.reset_jacobian(model.space, delta)
+
+    functions = {
+        "prior": LoweredFunction(prior, params, x, x),
+        "retraction": LoweredFunction(retraction, params, x, delta),
+    }
+    return functions, _reset_pattern(model, delta)
+
+
+def _reset_pattern(model: Model, delta: Any) -> Pattern:
+    traced = scalar_graph.trace(partial(manifold.reset_jacobian, model.space), delta)
+    return structured_matrix.find_pattern(sparsity.known_entries(traced))
+
+
+def _find_patterns(jacobians: Callable[..., Any], *spec: Any) -> list[Pattern]:
+    """The sparsity patterns of the Jacobians that a function makes."""
+
+    def dense(*args: Any) -> list[Array]:
+        found: list[Jacobian] = list(jacobians(*args))
+        return [one.dense() for one in found]
+
+    known = sparsity.known_entries(scalar_graph.trace(dense, *spec))
+    return [structured_matrix.find_pattern(one) for one in known]
+
+
+def _noise_function(
+    function: Callable[..., Array], *spec: Any
+) -> tuple[Callable[..., Array], bool]:
+    """A covariance function, returning only the variances where it is diagonal; and whether it is."""
+    known = sparsity.known_entries(scalar_graph.trace(function, *spec))
+    diagonal = np.all(known.is_zero() | np.eye(known.value.shape[0], dtype=bool))
+    return (partial(linearisation.variances, function), True) if diagonal else (function, False)
+
+
+def _warn_if_slow(
+    model: Model, source: str, fallbacks: tuple[str, ...], function: LoweredFunction
+) -> None:
+    """Warn of the operations that make a function of the model slow."""
+    if fallbacks:
+        warnings.warn(
+            SlowModelWarning(
+                f"model '{model.name}', {source}: a quaternion of the state goes through"
+                f" {', '.join(fallbacks)}, so that its derivative is taken by its four numbers, which is"
+                " slower; use the functions of jaxekf.geometry.rotation"
+            ),
+            stacklevel=2,
+        )
+    if function.unsupported:
+        warnings.warn(
+            SlowModelWarning(
+                f"model '{model.name}', {source}: got the operations {', '.join(function.unsupported)},"
+                " expected arithmetic, small products and rearrangements; each run takes them by itself,"
+                " which is slower"
+            ),
+            stacklevel=2,
+        )

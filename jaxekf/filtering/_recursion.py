@@ -1,292 +1,203 @@
-"""The recursion over time: many runs in blocks of lanes, and its derivative by the adjoint.
+"""The scan over time for many runs, and its reverse derivative by the adjoint.
 
-Arguments and results carry the runs on their first axis. Inside, a block of runs lies on the last axis
-and one scan takes it through time. The derivative goes back through the same steps, a few at a
-time: they are filtered again from the belief they started from, and only such beliefs are kept.
+Arguments and results carry the runs on their first axis. Inside, a batch of runs is on the last axis
+(lanes) and one scan takes it through time. The derivative (section 5 of docs/mathematics.md) goes
+backward segment by segment: the epochs of a segment are filtered again from the carry at its start, and
+only such carries are kept. `jaxekf.filtering.ekf` calls this file.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from jaxekf.filtering._lowered_model import System
-from jaxekf.filtering._step import Moment, Outcome, Track, begin, predict, update
-from jaxekf.filtering.lowering.batched_vjp import merge, unfilled
-from jaxekf.filtering.lowering.blocks import Blocks, Devices, in_blocks, over_more_runs, shape_of
-from jaxekf.filtering.lowering.packed import Packed, packed
+from jaxekf.filtering._epoch import SaveSpec, ScanInit, ScanInputs, ScanOutputs, scan_epoch
+from jaxekf.filtering._lowered_model import LoweredModel
+from jaxekf.filtering._step import FilterCarry, initial_carry
+from jaxekf.filtering.lowering.batched_vjp import cotangent_tree, merge_leaves
+from jaxekf.filtering.lowering.batching import (
+    BatchedArrays,
+    Devices,
+    batch_shape,
+    map_batches,
+    vmap_as_more_runs,
+)
+from jaxekf.filtering.lowering.packed import Packed, pack
 from jaxekf.filtering.model import Belief
-from jaxekf.geometry import linalg
 
-_LARGEST_UNROLLED_SUBSTEPS = 2
 _CACHE_BYTES = 1 << 20
 _MEMORY_BYTES = 1 << 32
 _BELIEFS_PER_STEP = 8
 _LONGEST_SEGMENT = 16
 
 
-class Given(NamedTuple):
-    """What the recursion is driven with; leading axes (K, S), slow samples (K,)."""
-
-    moments: Moment
-    fast: Any
-    slow: Any
-
-
-class First(NamedTuple):
-    """What a run starts from."""
-
-    belief: Belief
-    refused: Array | None = None
-    """Seconds of refused samples before the start."""
-
-
-class Kept(NamedTuple):
-    """What of every substep is kept; leading axes (K, S). None where it was not asked for."""
-
-    prior: Belief | None
-    mean: Any
-    cov: Array | None
-    log_likelihood: Array
-    healthy: Array
-    used: Any
-    """By sensor; (K, S, rows) for fast sensors, (K, rows) for slow ones."""
-    gated: Any
-    recovered: Array | None
-    """(K, S) where the gates were opened; None without gates."""
-    refused: Array | None
-    """(K, S) as in `Track`."""
-
-
-class What(NamedTuple):
-    """What to keep besides means and log-likelihoods."""
-
-    prior: bool
-    cov: bool
-    used: bool
-
-
-def _keep(what: What, outcome: Outcome) -> Kept:
-    return Kept(
-        outcome.prior if what.prior else None,
-        outcome.after.belief.mean,
-        linalg.symmetrise(outcome.after.belief.cov) if what.cov else None,
-        outcome.log_likelihood,
-        outcome.healthy,
-        outcome.used if what.used else {},
-        outcome.gated if what.used else {},
-        outcome.recovered if what.used else None,
-        outcome.after.refused if what.used else None,
-    )
-
-
-def _epoch(
-    system: System, what: What, adjoint: bool, prepared: Any, track: Track, given: Given
-) -> tuple[Track, Kept]:
-    """All substeps of one epoch; slow sensors are taken at the last."""
-    count = given.moments.dt.shape[0] - 1
-
-    def ahead(track: Track, moment: Moment) -> Track:
-        belief = predict(system, prepared, track.belief, moment, adjoint=adjoint)
-        return track._replace(belief=belief)
-
-    def take(ahead: Track, u: Any, samples: Any) -> tuple[Track, Kept]:
-        outcome = update(system, prepared, ahead, u, samples, adjoint=adjoint)
-        return outcome.after, _keep(what, outcome)
-
-    def substep(track: Track, at: Any) -> tuple[Track, Kept]:
-        moment, samples = at
-        return take(ahead(track, moment), moment.u, samples)
-
-    every = (given.moments, given.fast)
-    moment, fast = jax.tree.map(lambda a: a[-1], every)
-    if count and not given.fast:
-        # One scan over all predictions: the transition is compiled once, not twice.
-        prior, kept = lax.scan(substep, track, every)
-        track, last = take(prior, moment.u, given.slow)
-        earlier = jax.tree.map(lambda a: a[:-1], kept)
-        return track, _gathered(earlier, last, given.slow)
-    earlier = None
-    if count:
-        before = jax.tree.map(lambda a: a[:-1], every)
-        unroll = count <= _LARGEST_UNROLLED_SUBSTEPS
-        track, earlier = lax.scan(substep, track, before, unroll=unroll)
-    track, last = take(ahead(track, moment), moment.u, fast | given.slow)
-    return track, _gathered(earlier, last, given.slow)
-
-
-def _gathered(earlier: Kept | None, last: Kept, slow: Any) -> Kept:
-    """The substeps of an epoch one after the other; what slow sensors did apart from them."""
-    both = (last.used, last.gated)
-    ended = [{name: v for name, v in part.items() if name in slow} for part in both]
-    fast = [{name: v for name, v in part.items() if name not in slow} for part in both]
-    last = last._replace(used=fast[0], gated=fast[1])
-    if earlier is None:
-        whole = jax.tree.map(lambda a: a[None], last)
-    else:
-        whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), earlier, last)
-    return whole._replace(used=whole.used | ended[0], gated=whole.gated | ended[1])
-
-
-# --- one block of runs, on lanes ----------------------------------------------------------------------
+# --- one batch of runs, on the batch axis -------------------------------------------------------------
 
 
 def _scan(
-    system: System,
-    what: What,
-    adjoint: bool,
+    lowered: LoweredModel,
+    save: SaveSpec,
     segment: int | None,
     prepared: Any,
-    first: First,
-    given: Given,
-) -> tuple[Kept, Track | None]:
-    """All epochs; also, where `segment` is given, the track at the start of every `segment` epochs."""
-    track = begin(system, *first)
+    first: ScanInit,
+    inputs: ScanInputs,
+) -> tuple[ScanOutputs, FilterCarry | None]:
+    """All epochs; with `segment` also the carry at the start of every `segment` epochs.
 
-    def epoch(track: Track, given: Packed) -> tuple[Track, Packed]:
-        after, kept = _epoch(system, what, adjoint, prepared, track, given.opened())
-        return after, packed(kept)
+    It is not differentiated itself: `_scan_adjoint` is its derivative.
+    """
+    carry = initial_carry(lowered, *first)
+    bound = lowered.bind(prepared, adjoint=False)
+
+    def epoch(carry: FilterCarry, inputs: Packed) -> tuple[FilterCarry, Packed]:
+        carry, outputs = scan_epoch(bound, save, carry, inputs.unpack())
+        return carry, pack(outputs)
 
     if segment is None:
-        return lax.scan(epoch, track, packed(given, 1))[1].opened(), None
+        return lax.scan(epoch, carry, pack(inputs, 1))[1].unpack(), None
 
-    def stretch(track: Track, given: Packed) -> tuple[Track, tuple[Packed, Track]]:
-        after, kept = lax.scan(epoch, track, given)
-        return after, (kept, track)
+    def scan_segment(carry: FilterCarry, inputs: Packed) -> tuple[FilterCarry, Any]:
+        after, outputs = lax.scan(epoch, carry, inputs)
+        return after, (outputs, carry)
 
-    epochs = given.moments.dt.shape[0]
-    pieces = _cut(packed(_filled(given, segment), 1), segment)
-    kept, starts = lax.scan(stretch, track, pieces)[1]
-    return _joined(kept, epochs).opened(), starts
+    epochs = inputs.substeps.dt.shape[0]
+    segments = _split_segments(pack(_pad_epochs(inputs, segment), 1), segment)
+    outputs, starts = lax.scan(scan_segment, carry, segments)[1]
+    return _merge_segments(outputs, epochs).unpack(), starts
 
 
-def _filled(given: Given, segment: int) -> Given:
-    """`given` with inert steps at the end, so that segments divide it: no time passes, no row is visible.
+def _pad_epochs(inputs: ScanInputs, segment: int) -> ScanInputs:
+    """`inputs` with inert epochs at the end, so that segments divide it: no time passes, no row is visible.
 
-    All else is as at the last step, for a sampling period of zero, say, would divide the noise.
+    Everything else is as at the last epoch, since a sampling period of zero, say, would divide the noise.
     """
-    more = -given.moments.dt.shape[0] % segment
+    more = -inputs.substeps.dt.shape[0] % segment
     if not more:
-        return given
+        return inputs
 
     def hidden(samples: Any) -> Any:
         return {
             name: rows._replace(mask=jnp.zeros_like(rows.mask)) for name, rows in samples.items()
         }
 
-    last = jax.tree.map(lambda a: jnp.broadcast_to(a[-1:], (more, *a.shape[1:])), given)
-    still = last.moments._replace(dt=jnp.zeros_like(last.moments.dt))
-    inert = Given(still, hidden(last.fast), hidden(last.slow))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), given, inert)
+    last = jax.tree.map(lambda a: jnp.broadcast_to(a[-1:], (more, *a.shape[1:])), inputs)
+    still = last.substeps._replace(dt=jnp.zeros_like(last.substeps.dt))
+    inert = ScanInputs(still, hidden(last.fast), hidden(last.slow))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), inputs, inert)
 
 
-def _cut(tree: Any, segment: int) -> Any:
+def _split_segments(tree: Any, segment: int) -> Any:
     """Arrays (K, ...) in segments (K / segment, segment, ...), the last filled with zeros."""
 
-    def cut(a: Array) -> Array:
+    def split(a: Array) -> Array:
         more = -a.shape[0] % segment
         if more:
             a = jnp.concatenate([a, jnp.zeros((more, *a.shape[1:]), a.dtype)])
         return a.reshape(-1, segment, *a.shape[1:])
 
-    return jax.tree.map(cut, tree)
+    return jax.tree.map(split, tree)
 
 
-def _joined(tree: Any, epochs: int) -> Any:
-    """The segments of `_cut` as (epochs, ...) again, without what filled the last one."""
+def _merge_segments(tree: Any, epochs: int) -> Any:
+    """The inverse of `_split_segments`: (epochs, ...), without the zeros."""
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[:epochs], tree)
 
 
 @dataclass(frozen=True)
-class _Flags:
-    """Which leaves a derivative is asked by; known when the program is traced."""
+class _PerturbedLeaves:
+    """Which leaves of `prepared` and of the inputs a derivative is asked for; known at trace time."""
 
     prepared: tuple[bool, ...]
-    given: tuple[bool, ...]
+    inputs: tuple[bool, ...]
 
 
-jax.tree_util.register_static(_Flags)
+jax.tree_util.register_static(_PerturbedLeaves)
 
 
-def _scan_back(
-    system: System,
-    what: What,
+def _scan_adjoint(
+    lowered: LoweredModel,
+    save: SaveSpec,
     segment: int,
-    free: tuple[bool, ...],
-    moving: tuple[bool, ...],
+    perturbed: _PerturbedLeaves,
     live: tuple[bool, ...],
-    starts: Track,
+    starts: FilterCarry,
     prepared: Any,
-    given: Given,
+    inputs: ScanInputs,
     cotangents: list[Array],
 ) -> tuple[Any, Belief, list[Array]]:
-    """Cotangents of what was prepared, of the first belief, and of the moving leaves of `given`.
+    """Cotangents of the perturbed leaves of `prepared`, of the first belief, and of the perturbed inputs.
 
-    `cotangents` are those of the live leaves of `Kept`; the others have none. A segment is filtered again
-    from its start, and what the derivative of each epoch needs is kept until the way back through it.
+    `cotangents` are those of the `live` leaves of `ScanOutputs`; the others have none. A segment is
+    filtered again from its start, and the VJP residuals of each epoch are kept until the backward pass
+    through it.
     """
-    epochs = given.moments.dt.shape[0]
-    every, tree = jax.tree.flatten(_filled(given, segment))
+    epochs = inputs.substeps.dt.shape[0]
+    leaves, tree = jax.tree.flatten(_pad_epochs(inputs, segment))
     values, prepared_tree = jax.tree.flatten(prepared)
-    floats = [v for f, v in zip(free, values, strict=True) if f]
-    pulls = _Pulls()
+    floats = [v for f, v in zip(perturbed.prepared, values, strict=True) if f]
+    residuals = _VjpResiduals()
 
-    def stretch(carry: Any, at: Any) -> Any:
-        start, given, cotangents = at
+    def adjoint_segment(adjoint: Any, segment_inputs: Any) -> Any:
+        start, inputs, cotangents = segment_inputs
 
-        def step(track: Track, given: Packed) -> tuple[Track, Packed]:
-            leaves = given.opened()
+        def forward_epoch(carry: FilterCarry, inputs: Packed) -> tuple[FilterCarry, Packed]:
+            leaves = inputs.unpack()
 
-            def forward(floats: list[Array], track: Track, moved: list[Array]) -> Any:
-                full = jax.tree.unflatten(tree, merge(moving, moved, leaves))
-                own = jax.tree.unflatten(prepared_tree, merge(free, floats, values))
-                track, kept = _epoch(system, what, True, own, track, full)
-                live_kept = zip(live, jax.tree.leaves(kept), strict=True)
-                return (track, [v for f, v in live_kept if f])
+            def epoch(floats: list[Array], carry: FilterCarry, moved: list[Array]) -> Any:
+                full = jax.tree.unflatten(tree, merge_leaves(perturbed.inputs, moved, leaves))
+                own = merge_leaves(perturbed.prepared, floats, values)
+                bound = lowered.bind(jax.tree.unflatten(prepared_tree, own), adjoint=True)
+                carry, outputs = scan_epoch(bound, save, carry, full)
+                live_outputs = zip(live, jax.tree.leaves(outputs), strict=True)
+                return (carry, [v for f, v in live_outputs if f])
 
-            moved = [v for f, v in zip(moving, leaves, strict=True) if f]
-            (track, _), pull = jax.vjp(forward, floats, track, moved)
-            return track, packed(pulls.opened(pull, values, leaves))
+            moved = [v for f, v in zip(perturbed.inputs, leaves, strict=True) if f]
+            (carry, _), vjp = jax.vjp(epoch, floats, carry, moved)
+            return carry, pack(residuals.take(vjp, values, leaves))
 
-        def back(carry: Any, at: Any) -> Any:
-            after, total = carry
-            saved, leaves, cotangents = (one.opened() for one in at)
-            pull = pulls.closed(saved, values, leaves)
-            gained, before, of_given = pull((after, cotangents))
-            return (before, jax.tree.map(jnp.add, total, gained)), packed(of_given)
+        def backward_epoch(adjoint: Any, epoch_inputs: Any) -> Any:
+            after, total = adjoint
+            saved, leaves, cotangents = (one.unpack() for one in epoch_inputs)
+            vjp = residuals.restore(saved, values, leaves)
+            of_floats, before, of_inputs = vjp((after, cotangents))
+            return (before, jax.tree.map(jnp.add, total, of_floats)), pack(of_inputs)
 
-        _, saved = lax.scan(step, start, given)
-        return lax.scan(back, carry, (saved, given, cotangents), reverse=True)
+        _, saved = lax.scan(forward_epoch, start, inputs)
+        return lax.scan(backward_epoch, adjoint, (saved, inputs, cotangents), reverse=True)
 
     zero = jax.tree.map(lambda a: jnp.zeros(a.shape[1:], a.dtype), starts)
-    carry = (zero, jax.tree.map(jnp.zeros_like, floats))
-    pieces = (starts, _cut(packed(every, 1), segment), _cut(packed(cotangents, 1), segment))
-    (first, total), of_given = lax.scan(stretch, carry, pieces, reverse=True)
-    return total, first.belief, _joined(of_given, epochs).opened()
+    adjoint = (zero, jax.tree.map(jnp.zeros_like, floats))
+    split_inputs = _split_segments(pack(leaves, 1), segment)
+    segments = (starts, split_inputs, _split_segments(pack(cotangents, 1), segment))
+    (first, total), of_inputs = lax.scan(adjoint_segment, adjoint, segments, reverse=True)
+    return total, first.belief, _merge_segments(of_inputs, epochs).unpack()
 
 
-class _Pulls:
-    """The pullback of an epoch as arrays that a scan can hand over, without those that both sides have."""
+class _VjpResiduals:
+    """The residuals of an epoch's VJP as arrays that a scan can hand over.
+
+    Arrays that both the forward and the backward scan have anyway are left out.
+    """
 
     def __init__(self) -> None:
         self._tree: Any = None
         self._places: list[tuple[int, int] | None] = []
 
-    def opened(self, pull: Any, *shared: list[Array]) -> list[Array]:
-        """The arrays that `pull` holds and none of the lists `shared` does."""
+    def take(self, vjp: Any, *shared: list[Array]) -> list[Array]:
+        """The arrays that `vjp` holds and none of the lists `shared` does."""
         places = {id(a): (i, k) for i, own in enumerate(shared) for k, a in enumerate(own)}
-        leaves, self._tree = jax.tree.flatten(pull)
+        leaves, self._tree = jax.tree.flatten(vjp)
         self._places = [places.get(id(leaf)) for leaf in leaves]
         return [leaf for leaf, at in zip(leaves, self._places, strict=True) if at is None]
 
-    def closed(self, saved: list[Array], *shared: list[Array]) -> Any:
-        """The pullback, from what `opened` gave and the same lists."""
+    def restore(self, saved: list[Array], *shared: list[Array]) -> Any:
+        """The VJP function, from the result of `take` and the same lists."""
         own = iter(saved)
         leaves = [next(own) if at is None else shared[at[0]][at[1]] for at in self._places]
         return jax.tree.unflatten(self._tree, leaves)
@@ -295,74 +206,79 @@ class _Pulls:
 # --- all runs -----------------------------------------------------------------------------------------
 
 
-def filter_plainly(
-    system: System, what: What, checkpoint: bool, prepared: Any, first: First, given: Given
-) -> Kept:
-    """The recursion with JAX's own derivatives, forward and reverse."""
+def filter_with_jax_derivatives(
+    lowered: LoweredModel,
+    save: SaveSpec,
+    checkpoint: bool,
+    prepared: Any,
+    first: ScanInit,
+    inputs: ScanInputs,
+) -> ScanOutputs:
+    """The filter with JAX's own derivatives, forward and reverse."""
 
-    def runs(_: None, prepared: Any, first: First, given: Given) -> tuple[Kept, None]:
-        epoch = partial(_epoch, system, what, False, prepared)
+    def scan(_: None, prepared: Any, first: ScanInit, inputs: ScanInputs) -> Any:
+        epoch = partial(scan_epoch, lowered.bind(prepared, adjoint=False), save)
         if checkpoint:
             epoch = jax.checkpoint(epoch)
-        return lax.scan(epoch, begin(system, *first), given)[1], None
+        return lax.scan(epoch, initial_carry(lowered, *first), inputs)[1], None
 
-    return in_blocks((), runs, None, prepared, first, given)[0]
+    return map_batches((), scan, None, prepared, first, inputs)[0]
 
 
 def filter_with_adjoint(
-    system: System,
-    what: What,
+    lowered: LoweredModel,
+    save: SaveSpec,
     segment: int,
     devices: Devices,
     prepared: Any,
-    first: First,
-    given: Given,
-) -> Kept:
-    """The recursion with its reverse derivative by the adjoint; `segment` epochs between kept beliefs."""
-    return _with_adjoint(system, what, segment, devices)(prepared, first, given)
+    first: ScanInit,
+    inputs: ScanInputs,
+) -> ScanOutputs:
+    """The filter with its reverse derivative by the adjoint; `segment` epochs between kept carries."""
+    return _with_adjoint(lowered, save, segment, devices)(prepared, first, inputs)
 
 
 @lru_cache(maxsize=64)
 def _with_adjoint(
-    system: System, what: What, segment: int, devices: Devices
-) -> Callable[..., Kept]:
+    lowered: LoweredModel, save: SaveSpec, segment: int, devices: Devices
+) -> Callable[..., Any]:
     def run(segment: int | None, _: None, *trees: Any) -> Any:
         def scan(_: None, *trees: Any) -> Any:
-            return _scan(system, what, False, segment, *trees)
+            return _scan(lowered, save, segment, *trees)
 
-        kept, starts = in_blocks(devices, scan, None, *trees)
+        outputs, starts = map_batches(devices, scan, None, *trees)
         if segment is None:
-            return kept, None
-        return kept, Blocks(starts, jnp.zeros(jax.tree.leaves(trees)[0].shape[0]))
+            return outputs, None
+        return outputs, BatchedArrays(starts, jnp.zeros(jax.tree.leaves(trees)[0].shape[0]))
 
-    ahead = over_more_runs(devices, partial(run, None))
-    ahead_saving = over_more_runs(devices, partial(run, segment))
+    forward_only = vmap_as_more_runs(devices, partial(run, None))
+    forward_saving = vmap_as_more_runs(devices, partial(run, segment))
 
     @jax.custom_vjp
-    def function(prepared: Any, first: First, given: Given) -> Kept:
-        return ahead(None, prepared, first, given)[0]
+    def function(prepared: Any, first: ScanInit, inputs: ScanInputs) -> ScanOutputs:
+        return forward_only(None, prepared, first, inputs)[0]
 
-    def forward(prepared: Any, first: First, given: Given) -> Any:
-        flags = _Flags(_perturbed(prepared), _perturbed(given))
-        values = jax.tree.map(lambda leaf: leaf.value, (prepared, first, given))
-        kept, starts = ahead_saving(None, *values)
-        return kept, (values[0], starts, values[2], flags, first.refused is None)
+    def forward(prepared: Any, first: ScanInit, inputs: ScanInputs) -> Any:
+        perturbed = _PerturbedLeaves(_perturbed(prepared), _perturbed(inputs))
+        values = jax.tree.map(lambda leaf: leaf.value, (prepared, first, inputs))
+        outputs, starts = forward_saving(None, *values)
+        return outputs, (values[0], starts, values[2], perturbed, first.refused is None)
 
     def backward(saved: Any, cotangents: Any) -> Any:
-        prepared, starts, given, flags, at_rest = saved
-        cotangents = _symmetric(cotangents)
-        every = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
+        prepared, starts, inputs, perturbed, at_rest = saved
+        cotangents = _symmetrise_cotangents(cotangents)
+        leaves = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
         live = tuple(
-            not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in every
+            not isinstance(c, SymbolicZero) and jnp.issubdtype(c.dtype, jnp.inexact) for c in leaves
         )
-        chosen = [c for flag, c in zip(live, every, strict=True) if flag]
-        back = _backward(system, what, segment, devices, flags, live)
-        total, first, of_given = back(starts, prepared, given, chosen)[0]
-        # When samples were refused decides what is let in, but nothing depends on it smoothly.
+        chosen = [c for flag, c in zip(live, leaves, strict=True) if flag]
+        back = _adjoint_of_runs(lowered, save, segment, devices, perturbed, live)
+        total, first, of_inputs = back(starts, prepared, inputs, chosen)[0]
+        # When samples were rejected decides what is accepted, but nothing depends on it smoothly.
         refused = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
-        back_to_given = unfilled(given, flags.given, of_given)
-        back_to_prepared = unfilled(prepared, flags.prepared, total)
-        return back_to_prepared, First(first, refused), back_to_given
+        inputs_bar = cotangent_tree(inputs, perturbed.inputs, of_inputs)
+        prepared_bar = cotangent_tree(prepared, perturbed.prepared, total)
+        return prepared_bar, ScanInit(first, refused), inputs_bar
 
     function.defvjp(forward, backward, symbolic_zeros=True)
     return function
@@ -377,36 +293,35 @@ def _perturbed(tree: Any) -> tuple[bool, ...]:
 
 
 @lru_cache(maxsize=256)
-def _backward(
-    system: System,
-    what: What,
+def _adjoint_of_runs(
+    lowered: LoweredModel,
+    save: SaveSpec,
     segment: int,
     devices: Devices,
-    flags: _Flags,
+    perturbed: _PerturbedLeaves,
     live: tuple[bool, ...],
 ) -> Callable[..., Any]:
-    def scan(starts: Track, *trees: Any) -> Any:
-        asked = (flags.prepared, flags.given, live)
-        return _scan_back(system, what, segment, *asked, starts, *trees), None
+    def scan(starts: FilterCarry, *trees: Any) -> Any:
+        return _scan_adjoint(lowered, save, segment, perturbed, live, starts, *trees), None
 
-    def run(starts: Blocks, *trees: Any) -> Any:
-        count, size = shape_of(jax.tree.leaves(trees)[0].shape[0], devices)
+    def run(starts: BatchedArrays, *trees: Any) -> Any:
+        count, size = batch_shape(jax.tree.leaves(trees)[0].shape[0], devices)
 
         def fitting(a: Array) -> Array:
             # `custom_vmap` traces this for one member of a `vmap` before it asks for all of them, and
-            # the blocks hold all of them already: of that trace only the shapes are used.
+            # the batches hold all of them already: of that trace only the shapes are used.
             if (a.shape[0], a.shape[-1]) == (count, size):
                 return a
             return jnp.zeros((count, *a.shape[1:-1], size), a.dtype)
 
         arrays = jax.tree.map(fitting, starts.arrays)
-        return in_blocks(devices, scan, arrays, *trees)
+        return map_batches(devices, scan, arrays, *trees)
 
-    return over_more_runs(devices, run)
+    return vmap_as_more_runs(devices, run)
 
 
-def _symmetric(cotangents: Kept) -> Kept:
-    """The cotangents of the covariances kept, (runs, K, S, n, n), made symmetric."""
+def _symmetrise_cotangents(cotangents: ScanOutputs) -> ScanOutputs:
+    """Cotangents whose covariances (runs, K, S, n, n) are symmetric, as the closed forms need them."""
 
     def symmetric(cov: Any) -> Any:
         if cov is None or isinstance(cov, SymbolicZero):
@@ -420,10 +335,10 @@ def _symmetric(cotangents: Kept) -> Kept:
 
 
 def segment_length(epochs: int, substeps: int, bytes_per_belief: int) -> int:
-    """Epochs between kept beliefs.
+    """Number of epochs between kept carries.
 
-    What the derivatives of the epochs of a segment need, about `_BELIEFS_PER_STEP` beliefs a substep,
-    should stay in the second cache; with very many epochs the beliefs kept should not fill the memory.
+    The VJP residuals of a segment, about `_BELIEFS_PER_STEP` beliefs a substep, should fit into the second
+    cache; in a very long run the kept carries should not fill the memory.
     """
     fitting = _CACHE_BYTES // (_BELIEFS_PER_STEP * substeps * bytes_per_belief)
     segment = min(max(fitting, 2), _LONGEST_SEGMENT)

@@ -1,8 +1,8 @@
-"""Samples that are made of many like groups, such as the points of an image: taken one group at a time.
+"""Samples that are made of many equal groups, such as the points of an image, applied group by group.
 
-On lanes such a sample's arrays have the groups on the first axis, then rows, then lanes. All groups are
-linearised at the same state, so that the result is that of all rows at once; what is compiled is one
-group, whatever their number.
+On the batch axis their arrays are (groups, rows of a group, lanes). All groups are linearised at the same
+state, so that the result is that of all rows at once; one group is compiled, whatever their number. See
+`jaxekf.filtering.model.repeated`.
 """
 
 from typing import Any
@@ -14,14 +14,14 @@ from jax import Array, lax
 from jaxekf.filtering.steps import Rows
 
 
-def apart(rows: Rows, count: int) -> dict[str, Any]:
-    """Value, mask and `aux` of a sample (rows, lanes), the groups on the first axis: (count, r, lanes)."""
+def split_groups(rows: Rows, count: int) -> dict[str, Any]:
+    """Value, mask and `aux` of a sample (rows, lanes), with the groups first: (count, r, lanes)."""
     value, mask = (a.reshape(count, -1, a.shape[-1]) for a in (rows.value, rows.mask))
     return {"value": value, "mask": mask, "aux": rows.aux}
 
 
-def one_of(rows: Rows, count: int) -> Rows:
-    """Shapes and types of one of the groups of a sample without lanes."""
+def single_group_spec(rows: Rows, count: int) -> Rows:
+    """Shapes and types of one of the `count` groups of a sample, without a batch axis."""
 
     def first(spec: Any, share: int) -> Any:
         shape = (spec.shape[0] // share, *spec.shape[1:])
@@ -32,19 +32,19 @@ def one_of(rows: Rows, count: int) -> Rows:
     return rows._replace(value=value, mask=mask, aux=aux)
 
 
-def are_many(mask: Array) -> bool:
-    """Whether rows with this mask have groups on their first axis."""
-    return mask.ndim == 3
+def has_group_axis(rows: Array) -> bool:
+    """Whether an array of rows, such as a mask, is (groups, rows, lanes) instead of (rows, lanes)."""
+    return rows.ndim == 3
 
 
-def flat(values: Array) -> Array:
+def flatten_groups(values: Array) -> Array:
     """(groups, rows, lanes) as (all rows, lanes); (rows, lanes) as it is."""
     return values.reshape(-1, values.shape[-1])
 
 
 def any_row(mask: Array) -> Array:
-    """(lanes,) where any row counts."""
-    if not are_many(mask):
+    """(lanes,) True where any row is."""
+    if not has_group_axis(mask):
         found = mask[0]
         for i in range(1, mask.shape[0]):
             found = found | mask[i]

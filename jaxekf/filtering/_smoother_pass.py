@@ -1,12 +1,13 @@
-"""The smoother's pass back through a block of runs, on lanes.
+"""The smoother's backward pass for a batch of runs, on the batch axis.
 
-Modified Bryson-Frazier form: what the samples after an instant say is carried back as information on
-the error there, so that no predicted covariance is inverted and nothing is asked of the process noise.
-With the belief (x, P) of the filter and the information (a, L) of what came later,
+Modified Bryson-Frazier form: the samples after an instant are carried back as information on the error
+there, so that no predicted covariance is inverted and the process noise may be singular. With the belief
+(x, P) of the filter and the information (a, L) of later samples,
 
     x_smoothed = retract(x, P a),    P_smoothed = P - P L P,
 
-the latter counted from the smoothed mean. For a linear system both are those of Rauch, Tung, Striebel.
+in the tangent space at the smoothed mean. For a linear system both are those of Rauch, Tung and Striebel.
+`jaxekf.filtering.smoother` and `iterated_smoother` call this file.
 """
 
 from functools import partial
@@ -16,179 +17,188 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf.filtering import _covariance_algebra as covariance_algebra
+from jaxekf.filtering import _covariance_prediction as covariance_prediction
+from jaxekf.filtering import _covariance_update as covariance_update
 from jaxekf.filtering import _repeated_groups as repeated_groups
 from jaxekf.filtering import _substeps as substeps
-from jaxekf.filtering._covariance_algebra import Gained
-from jaxekf.filtering._lowered_model import System
-from jaxekf.filtering._recursion import First, Given
-from jaxekf.filtering._step import Moment, Track, any_used, begin, look, take_keeping
+from jaxekf.filtering._covariance_update import UpdateAccumulator
+from jaxekf.filtering._epoch import ScanInit, ScanInputs
+from jaxekf.filtering._lowered_model import BoundModel, LoweredModel
+from jaxekf.filtering._step import (
+    AppliedSensor,
+    FilterCarry,
+    SubstepInput,
+    any_used,
+    apply_sensor_saving,
+    initial_carry,
+    linearise_and_gate,
+)
 from jaxekf.filtering.lowering import structured_matrix
-from jaxekf.filtering.lowering.lanes import stage
+from jaxekf.filtering.lowering.batched_products import multiply, multiply_vector
+from jaxekf.filtering.lowering.lanes import materialise
 from jaxekf.filtering.lowering.structured_matrix import Bands, Pattern
 from jaxekf.filtering.model import Belief
 from jaxekf.geometry import linalg
 
 
 class Information(NamedTuple):
-    """What later samples say of the error at an instant: ``a`` (n, lanes) and ``L`` (n, n, lanes)."""
+    """Information of later samples on the error at an instant."""
 
     vector: Array
+    """a, (n, lanes)."""
     matrix: Array
+    """L, (n, n, lanes)."""
 
 
-class Filtered(NamedTuple):
-    """What the pass needs of the filter; leading axes (K, S)."""
+class FilteredBeliefs(NamedTuple):
+    """The filter's results that the backward pass needs; leading axes (K, S)."""
 
     prior: Belief
     updated: Belief
     refused: Array | None
+    """As in `FilterCarry`."""
 
 
-class _Instant(NamedTuple):
-    """One substep."""
+class _SmootherInput(NamedTuple):
+    """One substep of the backward pass."""
 
-    moment: Moment
-    before: Any
-    """Mean at the end of the substep before."""
-    refused: Array | None
-    """Seconds of refused samples at the end of the substep before."""
-    filtered: Filtered
+    substep: SubstepInput
+    mean_before: Any
+    """Filtered mean at the end of the substep before."""
+    refused_before: Array | None
+    """`FilterCarry.refused` at the end of the substep before."""
+    filtered: FilteredBeliefs
 
 
-def scan_back(
-    system: System, adjoint: bool, prepared: Any, first: First, given: Given, filtered: Filtered
+def smooth_backward(
+    lowered: LoweredModel,
+    adjoint: bool,
+    prepared: Any,
+    first: ScanInit,
+    inputs: ScanInputs,
+    filtered: FilteredBeliefs,
 ) -> tuple[Belief, Belief]:
-    """The smoothed beliefs at every substep, leading axes (K, S), and at the start."""
+    """The smoothed beliefs at every substep, leading axes (K, S), and at the start of the run.
+
+    Parameters
+    ----------
+    lowered, adjoint, prepared
+        The model, and the arguments of `LoweredModel.bind`.
+    first, inputs
+        The arguments of the filter.
+    filtered
+        Its results.
+    """
+    bound = lowered.bind(prepared, adjoint=adjoint)
     size, lanes = first.belief.cov.shape[1:]
     dtype = first.belief.cov.dtype
     nothing = Information(jnp.zeros((size, lanes), dtype), jnp.zeros((size, size, lanes), dtype))
-    start = begin(system, *first)
-    before = jax.tree.map(one_earlier, start.belief.mean, filtered.updated.mean)
+    start = initial_carry(lowered, *first)
+    before = jax.tree.map(shift_by_one, start.belief.mean, filtered.updated.mean)
     refused = None
     if start.refused is not None and filtered.refused is not None:
-        refused = one_earlier(start.refused, filtered.refused)
-    epoch = partial(_epoch, system, adjoint, prepared)
-    every = _Instant(given.moments, before, refused, filtered)
-    info, found = lax.scan(epoch, nothing, (every, given.fast, given.slow), reverse=True)
-    return found, smoothed(system, prepared, first.belief, info, adjoint=adjoint)
+        refused = shift_by_one(start.refused, filtered.refused)
+    own = _SmootherInput(inputs.substeps, before, refused, filtered)
+    epoch = partial(_epoch, bound)
+    info, found = lax.scan(epoch, nothing, (own, inputs.fast, inputs.slow), reverse=True)
+    return found, smoothed(bound, first.belief, info)
 
 
-def one_earlier(first: Array, every: Array) -> Array:
-    """The values (K, S, ...) at the end of each substep before: `first` is that of the start."""
-    flat = every.reshape(-1, *every.shape[2:])
-    return jnp.concatenate([first[None], flat[:-1]]).reshape(every.shape)
+def shift_by_one(first: Array, values: Array) -> Array:
+    """The values (K, S, ...) at the end of each substep before; `first` is the value at the start."""
+    flat = values.reshape(-1, *values.shape[2:])
+    return jnp.concatenate([first[None], flat[:-1]]).reshape(values.shape)
 
 
-def _epoch(
-    system: System, adjoint: bool, prepared: Any, info: Information, at: Any
-) -> tuple[Information, Belief]:
-    """All substeps of one epoch, the last first; slow sensors were taken at the last."""
-    every, fast, slow = at
+def _epoch(bound: BoundModel, info: Information, epoch_inputs: Any) -> tuple[Information, Belief]:
+    """All substeps of one epoch, the last first; slow sensors are sampled at the last."""
+    own, fast, slow = epoch_inputs
 
-    def substep(info: Information, at: Any) -> tuple[Information, Belief]:
-        instant, samples = at
-        belief = smoothed(system, prepared, instant.filtered.updated, info, adjoint=adjoint)
-        info = _before_update(system, prepared, info, instant, samples, adjoint)
-        return _before_prediction(system, prepared, info, instant, adjoint), belief
+    def substep(info: Information, substep_inputs: Any) -> tuple[Information, Belief]:
+        own, samples = substep_inputs
+        belief = smoothed(bound, own.filtered.updated, info)
+        info = _information_before_update(bound, info, own, samples)
+        return _information_before_prediction(bound, info, own), belief
 
-    return substeps.over_substeps_back(substep, info, (every, fast), slow)
+    return substeps.scan_substeps_backward(substep, info, (own, fast), slow)
 
 
-def lessened(p: Array, matrix: Array) -> Array:
-    """``P - P L P``."""
-    lost = stage(covariance_algebra.product(p, stage(covariance_algebra.product(matrix, p))))
-    return stage(linalg.symmetrise(p - lost))
+def smoothed_covariance(cov: Array, matrix: Array) -> Array:
+    """``P - P L P``, (n, n, lanes)."""
+    gain = materialise(multiply(matrix, cov))
+    return materialise(linalg.symmetrise(cov - materialise(multiply(cov, gain))))
 
 
-def smoothed(
-    system: System, prepared: Any, belief: Belief, info: Information, *, adjoint: bool
-) -> Belief:
-    """The belief of the filter with what came later."""
+def smoothed(bound: BoundModel, belief: Belief, info: Information) -> Belief:
+    """The filter's belief with the information of later samples."""
     p = belief.cov
-    delta = stage(covariance_algebra.apply(p, info.vector))
-    cov = lessened(p, info.matrix)
-    correction = system.correction
-    always = jnp.ones(p.shape[-1], bool)
-    mean, reset, _ = correction.piece(
-        prepared["correction"], belief.mean, delta, always, adjoint=adjoint
-    )
-    if not correction.reset.is_identity:
-        cov = linalg.symmetrise(covariance_algebra.congruence(correction.reset, reset, cov))
+    delta = materialise(multiply_vector(p, info.vector))
+    cov = smoothed_covariance(p, info.matrix)
+    mean, reset, _ = bound.correction(belief.mean, delta, jnp.ones(p.shape[-1], bool))
+    pattern = bound.lowered.reset_pattern
+    if not pattern.is_identity:
+        cov = linalg.symmetrise(covariance_prediction.congruence(pattern, reset, cov))
     return Belief(mean, cov)
 
 
-def _before_prediction(
-    system: System, prepared: Any, info: Information, instant: _Instant, adjoint: bool
+def _information_before_prediction(
+    bound: BoundModel, info: Information, own: _SmootherInput
 ) -> Information:
-    """From the end of a prediction to its start: ``F' a`` and ``F' L F``."""
-    transition, moment = system.transition, instant.moment
-    found = transition.piece(
-        prepared["transition"], instant.before, moment.u, moment.dt, adjoint=adjoint
-    )
-    return carried(transition.state, found[1], info)
+    """``F' a`` and ``F' L F``."""
+    _, f, _ = bound.transition(own.mean_before, own.substep.u, own.substep.dt)
+    return pull_back(bound.lowered.transition.f_pattern, f, info)
 
 
-def carried(p: Pattern, bands: Bands, info: Information) -> Information:
-    """``M' a`` and ``M' L M``."""
-    back, turned = p.transposed, structured_matrix.transpose(bands)
-    vector = stage(structured_matrix.multiply(back, turned, info.vector))
-    return Information(
-        vector, linalg.symmetrise(covariance_algebra.congruence(back, turned, info.matrix))
-    )
+def pull_back(p: Pattern, bands: Bands, info: Information) -> Information:
+    """``M' a`` and ``M' L M``: information on ``M x`` as information on ``x``."""
+    back, transposed = p.transposed, structured_matrix.transpose_bands(bands)
+    vector = materialise(structured_matrix.multiply(back, transposed, info.vector))
+    matrix = covariance_prediction.congruence(back, transposed, info.matrix)
+    return Information(vector, linalg.symmetrise(matrix))
 
 
-def _before_update(
-    system: System,
-    prepared: Any,
-    info: Information,
-    instant: _Instant,
-    samples: dict[str, Any],
-    adjoint: bool,
+def _information_before_update(
+    bound: BoundModel, info: Information, own: _SmootherInput, samples: dict[str, Any]
 ) -> Information:
-    """From after the samples of an instant to before them; they are taken again to see their gain."""
+    """The information before the samples of an instant, which are applied again to get their gains."""
     if not samples:
         return info
-    prior = instant.filtered.prior
-    ahead = Track(prior, instant.refused)
-    judged, cov = look(system, prepared, ahead, instant.moment.u, samples, adjoint=adjoint)
-    linear = judged.linear
-    gained = Gained(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
-    taken = []
+    prior = own.filtered.prior
+    predicted = FilterCarry(prior, own.refused_before)
+    result, cov = linearise_and_gate(bound, predicted, own.substep.u, samples)
+    linear = result.linear
+    accumulator = UpdateAccumulator(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))
+    applied = []
     for one in linear.values():
-        gained, kept = take_keeping(one.slope, gained, one.rows)
-        taken.append((covariance_algebra.pattern_taken(one.slope, one.rows), kept))
-    correction = system.correction
-    used = any_used(linear)
-    _, reset, shift = correction.piece(
-        prepared["correction"], prior.mean, gained.delta, used, adjoint=adjoint
-    )
+        accumulator, saved = apply_sensor_saving(one, accumulator)
+        applied.append(saved)
+    _, reset, shift = bound.correction(prior.mean, accumulator.delta, any_used(linear))
     if shift is not None:
-        # The model's constraint moved the mean: what is known is counted from where it had been.
-        vector = info.vector + stage(covariance_algebra.apply(info.matrix, shift))
+        # The model's constraint moved the mean: the information refers to the mean before that.
+        vector = info.vector + materialise(multiply_vector(info.matrix, shift))
         info = info._replace(vector=vector)
-    if not correction.reset.is_identity:
-        info = carried(correction.reset, reset, info)
-    for slope, kept in reversed(taken):
-        info = before_rows(slope, kept, info)
+    pattern = bound.lowered.reset_pattern
+    if not pattern.is_identity:
+        info = pull_back(pattern, reset, info)
+    for saved in reversed(applied):
+        info = information_before_rows(saved, info)
     return info
 
 
-def before_rows(p: Pattern, kept: Any, info: Information) -> Information:
-    """``A' a + H' s`` and ``A' L A + H' S^-1 H`` with ``A = I - K H``, of rows that `step.take_keeping`
-    took."""
-    rows, taken = kept
-    if repeated_groups.are_many(rows.mask):
+def information_before_rows(applied: AppliedSensor, info: Information) -> Information:
+    """The information before the rows of one sensor: ``A' a + H' s`` and ``A' L A + H' S^-1 H``, with
+    ``A = I - K H`` and s the weighted innovation."""
+    p, rows, blocks = applied
+    if repeated_groups.has_group_axis(rows.mask):
 
-        def one(info: Information, kept: Any) -> tuple[Information, None]:
-            return before_rows(p, kept, info), None
+        def one(info: Information, group: Any) -> tuple[Information, None]:
+            return information_before_rows(AppliedSensor(p, *group), info), None
 
-        return lax.scan(one, info, kept, reverse=True)[0]
+        return lax.scan(one, info, (rows, blocks), reverse=True)[0]
     vector, matrix = info
-    for block, (gain, inverse, scaled) in reversed(
-        list(zip(covariance_algebra.blocks(p, rows), taken, strict=True))
-    ):
-        matrix, _ = covariance_algebra.back_through(block, gain, matrix, inverse, None)
-        push = stage(block.shown(scaled - covariance_algebra.apply(gain, vector)))
-        vector = stage(vector + block.back(push))
+    pairs = list(zip(covariance_update.row_blocks(p, rows), blocks, strict=True))
+    for block, (gain, inverse, weighted) in reversed(pairs):
+        matrix, _ = covariance_update.information_before_block(block, gain, matrix, inverse, None)
+        push = materialise(block.masked(weighted - multiply_vector(gain, vector)))
+        vector = materialise(vector + block.transposed_multiply(push))
     return Information(vector, matrix)

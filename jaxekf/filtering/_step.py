@@ -1,4 +1,8 @@
-"""One step of the filter on lanes: predict, compare, update."""
+"""One step of the filter for a batch of runs: predict, linearise and gate, update.
+
+Arrays carry the runs on the last axis (lanes). `jaxekf.filtering._recursion` scans these functions over
+time.
+"""
 
 import operator
 from functools import partial, reduce
@@ -8,12 +12,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxekf.filtering import _covariance_algebra as covariance_algebra
+from jaxekf.filtering import _covariance_prediction as covariance_prediction
+from jaxekf.filtering import _covariance_update as covariance_update
 from jaxekf.filtering import _gating as gating
 from jaxekf.filtering import _repeated_groups as repeated_groups
-from jaxekf.filtering._covariance_algebra import Gained
-from jaxekf.filtering._gating import Judged, Linear
-from jaxekf.filtering._lowered_model import Measurement, System
+from jaxekf.filtering._covariance_update import MeasurementRows, UpdateAccumulator
+from jaxekf.filtering._gating import GatingResult, LinearisedRows
+from jaxekf.filtering._lowered_model import BoundModel, LoweredModel, LoweredSensor
 from jaxekf.filtering.lowering import structured_matrix
 from jaxekf.filtering.lowering.structured_matrix import Bands, Pattern
 from jaxekf.filtering.model import Belief
@@ -21,129 +26,123 @@ from jaxekf.filtering.steps import Rows
 from jaxekf.geometry import linalg
 
 
-class Moment(NamedTuple):
-    """What a substep is given besides samples."""
+class SubstepInput(NamedTuple):
+    """The inputs of a substep besides samples."""
 
     dt: Array
+    """(lanes,) seconds."""
     u: Any
+    """`InputSample`, or None for a model without input."""
 
 
-class Track(NamedTuple):
-    """What is carried from one substep to the next."""
+class FilterCarry(NamedTuple):
+    """The carry of the scan over substeps."""
 
     belief: Belief
     refused: Array | None
-    """(lanes,) seconds of samples that gates have refused since they last let one in; None without
+    """(lanes,) seconds of samples that gates have rejected since they last accepted one; None without
     gates."""
 
 
-class Outcome(NamedTuple):
-    """What one substep leaves behind."""
+class StepOutput(NamedTuple):
+    """The results of one substep."""
 
     prior: Belief
-    after: Track
+    """The prediction."""
+    carry: FilterCarry
+    """After the update."""
     log_likelihood: Array
+    """(lanes,) of the rows that entered the update."""
     healthy: Array
+    """(lanes,) False where a covariance is not finite or not definite."""
     used: dict[str, Array]
     """By sensor: (rows, lanes) rows that entered the update."""
     gated: dict[str, Array]
+    """By sensor: (rows, lanes) visible rows that a gate rejected."""
     recovered: Array | None
-    """(lanes,) where the gates were opened and the belief widened; None without gates."""
+    """(lanes,) where the gates were reset and the belief widened; None without gates."""
 
 
-def begin(system: System, belief: Belief, refused: Array | None) -> Track:
-    """The track at the start of a run, `refused` seconds (lanes,) into refusing samples; None for 0."""
-    if not system.is_gated:
-        return Track(belief, None)
+def initial_carry(lowered: LoweredModel, belief: Belief, refused: Array | None) -> FilterCarry:
+    """The carry at the start of a run; `refused` (lanes,) as in `FilterCarry`, None for 0."""
+    if not lowered.is_gated:
+        return FilterCarry(belief, None)
     if refused is None:
         refused = jnp.zeros(belief.cov.shape[-1], belief.cov.dtype)
-    return Track(belief, refused)
+    return FilterCarry(belief, refused)
 
 
-def predict(
-    system: System, prepared: Any, belief: Belief, moment: Moment, *, adjoint: bool
-) -> Belief:
-    """The belief at the end of the substep: ``P = F P F' + G Sigma G'``.
-
-    With `adjoint` reverse derivatives are the closed forms of `jaxekf.filtering._covariance_algebra`;
-    without, every derivative is JAX's own.
-    """
-    transition = system.transition
-    mean, f, g = transition.piece(
-        prepared["transition"], belief.mean, moment.u, moment.dt, adjoint=adjoint
+def predict(bound: BoundModel, belief: Belief, inputs: SubstepInput) -> Belief:
+    """The prediction at the end of the substep (docs/mathematics.md, section 2)."""
+    transition = bound.lowered.transition
+    mean, f, g = bound.transition(belief.mean, inputs.u, inputs.dt)
+    sigma = bound.process_noise(inputs.dt)
+    patterns = (transition.f_pattern, transition.g_pattern)
+    cov = covariance_prediction.predicted_covariance(
+        patterns, f, g, belief.cov, sigma, adjoint=bound.adjoint
     )
-    (sigma,) = transition.sigma(prepared["process noise"], moment.dt, adjoint=adjoint)
-    patterns = (transition.state, transition.noise)
-    if adjoint:
-        return Belief(
-            mean, covariance_algebra.predicted_with_adjoint(*patterns)(f, g, belief.cov, sigma)
-        )
-    return Belief(mean, covariance_algebra.predicted(*patterns, f, g, belief.cov, sigma))
+    return Belief(mean, cov)
 
 
 def update(
-    system: System,
-    prepared: Any,
-    ahead: Track,
-    u: Any,
-    samples: dict[str, Rows],
-    *,
-    adjoint: bool,
-) -> Outcome:
-    """Take every sensor sampled at the end of a substep; `adjoint` as in `predict`."""
-    prior = ahead.belief
-    judged, cov = look(system, prepared, ahead, u, samples, adjoint=adjoint)
-    linear = judged.linear
-    used = {name: repeated_groups.flat(one.rows.mask) for name, one in linear.items()}
-    gated = {name: repeated_groups.flat(mask) for name, mask in judged.gated.items()}
+    bound: BoundModel, predicted: FilterCarry, u: Any, samples: dict[str, Rows]
+) -> StepOutput:
+    """The update by every sensor sampled at the end of a substep (docs/mathematics.md, section 3)."""
+    prior = predicted.belief
+    result, cov = linearise_and_gate(bound, predicted, u, samples)
+    linear = result.linear
+    used = {name: repeated_groups.flatten_groups(one.rows.mask) for name, one in linear.items()}
+    gated = {name: repeated_groups.flatten_groups(mask) for name, mask in result.gated.items()}
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
-        nothing, sound = jnp.zeros(lanes, dtype), _is_sound(prior.cov)
-        never = None if ahead.refused is None else jnp.zeros(lanes, bool)
-        return Outcome(prior, ahead, nothing, sound, used, gated, never)
-    gained = Gained(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
+        zero, valid = jnp.zeros(lanes, dtype), _has_valid_variances(prior.cov)
+        never = None if predicted.refused is None else jnp.zeros(lanes, bool)
+        return StepOutput(prior, predicted, zero, valid, used, gated, never)
+    accumulator = UpdateAccumulator(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
     for one in linear.values():
-        gained, pivot = take_block(one.slope, gained, one.rows, adjoint)
+        accumulator, pivot = apply_sensor(one, accumulator, adjoint=bound.adjoint)
         smallest = jnp.minimum(smallest, pivot)
-    posterior = _correct(system, prepared["correction"], prior, gained, any_used(linear), adjoint)
-    if system.again is not None:
+    posterior = _correct(bound, prior, accumulator, any_used(linear))
+    if bound.lowered.iterated_update is not None:
         widened = Belief(prior.mean, cov)
-        posterior, pivot = system.again(
-            prepared["again"], widened, posterior, u, samples, linear, adjoint=adjoint
+        posterior, pivot = bound.lowered.iterated_update(
+            bound.iterated_update(), widened, posterior, u, samples, linear
         )
         smallest = jnp.minimum(smallest, pivot)
-    healthy = (smallest > 0.0) & _is_sound(posterior.cov)
-    after = Track(posterior, judged.refused)
-    told = (used, gated, judged.recovered)
-    return Outcome(prior, after, gained.log_likelihood, healthy, *told)
+    healthy = (smallest > 0.0) & _has_valid_variances(posterior.cov)
+    carry = FilterCarry(posterior, result.refused)
+    log_likelihood = accumulator.log_likelihood
+    return StepOutput(prior, carry, log_likelihood, healthy, used, gated, result.recovered)
 
 
-def look(
-    system: System,
-    prepared: Any,
-    ahead: Track,
-    u: Any,
-    samples: dict[str, Rows],
-    *,
-    adjoint: bool,
-) -> tuple[Judged, Array]:
-    """Every sensor linearised at the prediction and judged by gates and weights; and the predicted
-    covariance, widened where the gates were opened."""
-    prior = ahead.belief
-    seen: dict[str, Linear] = {}
+def linearise_and_gate(
+    bound: BoundModel, predicted: FilterCarry, u: Any, samples: dict[str, Rows]
+) -> tuple[GatingResult, Array]:
+    """Every sensor linearised at the prediction, after gates and weights; and the predicted covariance,
+    inflated where the gates were reset."""
+    prior = predicted.belief
+    linear = linearise(bound, prior.mean, u, samples)
+    result = gating.gate_and_weight(bound.lowered, linear, samples, prior.cov, predicted.refused)
+    cov = prior.cov if result.inflation is None else prior.cov * result.inflation[None, None]
+    return result, cov
+
+
+def linearise(
+    bound: BoundModel, x: Any, u: Any, samples: dict[str, Rows]
+) -> dict[str, LinearisedRows]:
+    """Every sensor linearised at the state `x`."""
+    linear = {}
     for name, sample in samples.items():
-        measurement = system.measurements[name]
-        constants = prepared[f"sensor {name}"]
-        found = measurement(constants, prior.mean, u, sample, adjoint=adjoint)
-        seen[name] = hide(measurement, *found, sample.mask)
-    judged = gating.judge(system, seen, samples, prior.cov, ahead.refused)
-    cov = prior.cov if judged.widened is None else prior.cov * judged.widened[None, None]
-    return judged, cov
+        residual, jacobian, noise = bound.sensor(name, x, u, sample)
+        linear[name] = mask_rows(
+            bound.lowered.sensors[name], residual, jacobian, noise, sample.mask
+        )
+    return linear
 
 
-def _is_sound(cov: Array) -> Array:
-    """Whether all variances are finite and not negative."""
+def _has_valid_variances(cov: Array) -> Array:
+    """(lanes,) whether all variances are finite and not negative."""
     smallest = largest = cov[0, 0]
     for i in range(1, cov.shape[0]):
         smallest = jnp.minimum(smallest, cov[i, i])
@@ -151,76 +150,95 @@ def _is_sound(cov: Array) -> Array:
     return (smallest >= 0.0) & (largest < jnp.inf)
 
 
-def hide(
-    measurement: Measurement, residual: Array, slope: Bands, noise: Array, mask: Array
-) -> Linear:
-    """Hidden rows made inert: no slope and no noise, whatever their numbers are."""
-    if repeated_groups.are_many(residual):
+def mask_rows(
+    sensor: LoweredSensor, residual: Array, jacobian: Bands, noise: Array, mask: Array
+) -> LinearisedRows:
+    """Rows of a sensor, with Jacobian and noise 0 in hidden rows, whatever their numbers are."""
+    if repeated_groups.has_group_axis(residual):
         mask = mask.reshape(residual.shape)
-        hidden = jax.vmap(partial(_hide, measurement))(residual, slope, noise, mask)
+        rows = jax.vmap(partial(_masked, sensor))(residual, jacobian, noise, mask)
     else:
-        hidden = _hide(measurement, residual, slope, noise, mask)
-    return Linear(measurement.slope, hidden)
+        rows = _masked(sensor, residual, jacobian, noise, mask)
+    return LinearisedRows(sensor.pattern, rows)
 
 
-def _hide(
-    measurement: Measurement, residual: Array, slope: Bands, noise: Array, mask: Array
-) -> covariance_algebra.Rows:
+def _masked(
+    sensor: LoweredSensor, residual: Array, jacobian: Bands, noise: Array, mask: Array
+) -> MeasurementRows:
     bands = [
-        jnp.where(structured_matrix.take(mask, rows, 0)[:, None], band, 0.0)
-        for band, (rows, _) in zip(slope, measurement.slope.bands, strict=True)
+        jnp.where(structured_matrix.take_slices(mask, rows, 0)[:, None], band, 0.0)
+        for band, (rows, _) in zip(jacobian, sensor.pattern.bands, strict=True)
     ]
-    both = mask if measurement.diagonal else mask[:, None] & mask[None]
-    return covariance_algebra.Rows(residual, tuple(bands), jnp.where(both, noise, 0.0), mask)
+    both = mask if sensor.has_diagonal_noise else mask[:, None] & mask[None]
+    return MeasurementRows(residual, tuple(bands), jnp.where(both, noise, 0.0), mask)
 
 
-def take_block(
-    slope: Pattern, gained: Gained, rows: covariance_algebra.Rows, adjoint: bool
-) -> tuple[Gained, Array]:
-    """A block of rows taken, and the smallest variance of an innovation met."""
-    if repeated_groups.are_many(rows.mask):
+def apply_sensor(
+    linear: LinearisedRows, accumulator: UpdateAccumulator, *, adjoint: bool
+) -> tuple[UpdateAccumulator, Array]:
+    """Apply the rows of one sensor; also the smallest pivot (lanes,) of the innovation covariances."""
+    pattern, rows = linear
+    if repeated_groups.has_group_axis(rows.mask):
 
-        def one(carry: tuple[Gained, Array], rows: covariance_algebra.Rows) -> tuple[Any, None]:
-            gained, pivot = take_block(slope, carry[0], rows, adjoint)
+        def one(carry: tuple[UpdateAccumulator, Array], rows: MeasurementRows) -> tuple[Any, None]:
+            group = LinearisedRows(pattern, rows)
+            accumulator, pivot = apply_sensor(group, carry[0], adjoint=adjoint)
             # Rounding that is not symmetric grows from one group to the next.
-            gained = gained._replace(cov=linalg.symmetrise(gained.cov))
-            return (gained, jnp.minimum(carry[1], pivot)), None
+            accumulator = accumulator._replace(cov=linalg.symmetrise(accumulator.cov))
+            return (accumulator, jnp.minimum(carry[1], pivot)), None
 
-        return lax.scan(one, (gained, jnp.ones_like(gained.log_likelihood)), rows)[0]
-    slope, rows, determinant = covariance_algebra.whitened(slope, rows)
+        carry = (accumulator, jnp.ones_like(accumulator.log_likelihood))
+        return lax.scan(one, carry, rows)[0]
+    pattern, rows, determinant = covariance_update.whiten_rows(pattern, rows)
     if determinant is not None:
-        gained = gained._replace(log_likelihood=gained.log_likelihood + determinant)
-    if adjoint:
-        return covariance_algebra.update_with_adjoint(slope)(gained, rows)
-    return covariance_algebra.update(slope, gained, rows)
+        log_likelihood = accumulator.log_likelihood + determinant
+        accumulator = accumulator._replace(log_likelihood=log_likelihood)
+    return covariance_update.apply_rows(pattern, accumulator, rows, adjoint=adjoint)
 
 
-def take_keeping(
-    slope: Pattern, gained: Gained, rows: covariance_algebra.Rows
-) -> tuple[Gained, Any]:
-    """A block of rows taken, and what the way back through it needs."""
-    if repeated_groups.are_many(rows.mask):
-        return lax.scan(lambda gained, rows: take_keeping(slope, gained, rows), gained, rows)
-    slope, rows, _ = covariance_algebra.whitened(slope, rows)
-    gained, _, taken, _ = covariance_algebra.take(slope, gained, rows)
-    return gained, (rows, taken)
+class AppliedSensor(NamedTuple):
+    """The rows of one sensor after they were applied, for the smoother's way back through them."""
+
+    pattern: Pattern
+    """Sparsity of H, whitened."""
+    rows: MeasurementRows
+    """Whitened; with repeated groups a leading axis more, as the next."""
+    blocks: list[covariance_update.AppliedBlock]
 
 
-def any_used(linear: dict[str, Linear]) -> Array:
-    """(lanes,) where any row of any sensor counts."""
+def apply_sensor_saving(
+    linear: LinearisedRows, accumulator: UpdateAccumulator
+) -> tuple[UpdateAccumulator, AppliedSensor]:
+    """Apply the rows of one sensor, and save what the smoother needs of them."""
+
+    def one(accumulator: UpdateAccumulator, rows: MeasurementRows) -> tuple[Any, Any]:
+        whitened, rows, _ = covariance_update.whiten_rows(linear.pattern, rows)
+        accumulator, _, blocks, _ = covariance_update.apply_rows_saving(whitened, accumulator, rows)
+        return accumulator, (rows, blocks)
+
+    is_repeated = repeated_groups.has_group_axis(linear.rows.mask)
+    scan = partial(lax.scan, one) if is_repeated else one
+    accumulator, (rows, blocks) = scan(accumulator, linear.rows)
+    pattern = covariance_update.whitened_pattern(linear.pattern, linear.rows)
+    return accumulator, AppliedSensor(pattern, rows, blocks)
+
+
+def any_used(linear: dict[str, LinearisedRows]) -> Array:
+    """(lanes,) where any row of any sensor enters the update."""
     return reduce(operator.or_, [repeated_groups.any_row(one.rows.mask) for one in linear.values()])
 
 
 def _correct(
-    system: System, constants: Any, prior: Belief, gained: Gained, used: Array, adjoint: bool
+    bound: BoundModel, prior: Belief, accumulator: UpdateAccumulator, used: Array
 ) -> Belief:
-    """The mean moved by the error vector and the covariance counted from there, where rows were `used`."""
-    correction = system.correction
-    mean, reset, _ = correction.piece(constants, prior.mean, gained.delta, used, adjoint=adjoint)
-    if correction.reset.is_identity:
+    """The mean moved by the error vector, and the reset of the covariance (docs/mathematics.md, section 4).
+
+    Both only where `used`, (lanes,).
+    """
+    mean, reset, _ = bound.correction(prior.mean, accumulator.delta, used)
+    pattern = bound.lowered.reset_pattern
+    if pattern.is_identity:
         # Symmetric but for rounding, which the next prediction ends.
-        return Belief(mean, gained.cov)
-    turn = partial(covariance_algebra.congruence, correction.reset)
-    if adjoint:
-        turn = covariance_algebra.congruence_with_adjoint(correction.reset)
-    return Belief(mean, turn(reset, gained.cov))
+        return Belief(mean, accumulator.cov)
+    cov = covariance_prediction.congruence(pattern, reset, accumulator.cov, adjoint=bound.adjoint)
+    return Belief(mean, cov)

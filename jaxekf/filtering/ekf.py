@@ -1,9 +1,9 @@
 """The extended Kalman filter on a state space: one `lax.scan` over epochs, Jacobians by autodiff.
 
 The covariance is that of the error vector, ``x_true = retract(x, error)``. All rows of all sensors at
-one instant are linearised at the same predicted state, so that their order does not matter, and taken
-in Joseph's form, which keeps the covariance definite. A model is written for one run; it is filtered
-over many, see `jaxekf.filtering._recursion`.
+one instant are linearised at the same predicted state, so that their order does not matter, and applied
+in Joseph's form, which keeps the covariance definite. A model is written for one run; the filter runs
+it for many, see `jaxekf.filtering._recursion`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,14 +17,14 @@ from jax import Array
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering import _gating as gating
 from jaxekf.filtering import _lowered_model as lowered_model
-from jaxekf.filtering import _lowered_path as lowered_path
 from jaxekf.filtering import _recursion as recursion
-from jaxekf.filtering._iterated_update import again, with_again
+from jaxekf.filtering._epoch import SaveSpec, ScanInit, ScanInputs, ScanOutputs
+from jaxekf.filtering._iterated_update import with_iterated_update
 from jaxekf.filtering._linearisation import linearise_sensor
-from jaxekf.filtering._recursion import First, Given, Kept, What
-from jaxekf.filtering._step import Moment
+from jaxekf.filtering._lowered_model import ABOUT_PATH, AT_ESTIMATE, Linearisation, LoweredModel
+from jaxekf.filtering._step import SubstepInput
 from jaxekf.filtering.interpolation import InputSample, sample
-from jaxekf.filtering.lowering import blocks
+from jaxekf.filtering.lowering import batching
 from jaxekf.filtering.lowering.reverse_only import reverse_only
 from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
 from jaxekf.filtering.steps import Rows, Steps
@@ -32,17 +32,17 @@ from jaxekf.geometry import linalg
 
 _MANY_ROWS = 12
 Keep = Literal["everything", "estimates", "means"]
-_KEPT: dict[str, What] = {
-    "everything": What(prior=True, cov=True, used=True),
-    "estimates": What(prior=False, cov=True, used=False),
-    "means": What(prior=False, cov=False, used=False),
+_SAVE_SPECS: dict[str, SaveSpec] = {
+    "everything": SaveSpec(prior=True, cov=True, used=True),
+    "estimates": SaveSpec(prior=False, cov=True, used=False),
+    "means": SaveSpec(prior=False, cov=False, used=False),
 }
-RUNS_AT_ONCE = blocks.LANES
+RUNS_AT_ONCE = batching.LANES
 """Number of runs that one processor filters at once."""
 
 
 class Innovation(NamedTuple):
-    """What one sensor said at each of its instants, against what was predicted."""
+    """The innovations of one sensor: measured against predicted samples."""
 
     residual: Array
     """(..., rows) measured minus predicted, in the sensor's error vector; 0 where not used."""
@@ -51,51 +51,51 @@ class Innovation(NamedTuple):
     used: Array
     """(..., rows) rows that entered the update."""
     gated: Array
-    """(..., rows) visible rows that the chi-square gate kept out."""
+    """(..., rows) visible rows that the chi-square gate rejected."""
     nis: Array
     """(...) normalised innovation squared of the visible rows, gated ones included, none weighted."""
     weight: Array | None
-    """(..., rows) what the noise of a row was divided by: 1 where it counted in full, 0 where it was not
-    used; None for a sensor without weighting."""
+    """(..., rows) factor by which the noise of a row was divided: 1 for full weight, 0 where not used; None
+    for a sensor without weighting."""
 
 
 class Updated(NamedTuple):
-    """The belief after the samples of a substep; a covariance of None was not kept."""
+    """The belief after the samples of a substep, without the covariance if that was not kept."""
 
     mean: Any
     cov: Array | None
 
 
 class Instant(NamedTuple):
-    """The filter at the end of each substep; leading axes (K, S)."""
+    """The filter's results at the end of each substep; leading axes (K, S)."""
 
     predicted: Belief | None
-    """None where only estimates or means were kept."""
+    """None if only estimates or means were kept."""
     updated: Any
-    """`Belief`, or `Updated` where only means were kept."""
+    """`Belief`, or `Updated` if only means were kept."""
     log_likelihood: Array
     """Log density of the rows used, given all rows before them."""
     healthy: Array
-    """False where a covariance lost finiteness or definiteness."""
+    """False where a covariance is not finite or not definite."""
     recovered: Array | None
-    """Where gates that let nothing in were opened and the belief widened (see `Model.patience_s`); None
-    without gates, or where not kept."""
+    """True where the gates were reset and the belief was widened (see `Model.gate_reset_after_s`); None
+    without gates, or if not kept."""
     refused: Array | None
-    """Seconds of samples that gates have refused since they last let one in; None likewise."""
+    """Seconds of samples that gates have rejected since they last accepted one; None likewise."""
 
 
 class FilterOutput(NamedTuple):
-    """Everything a run of the filter produces."""
+    """The results of the filter for a run."""
 
     instants: Instant
     inputs: InputSample | None
-    """The input as each substep saw it, leading axes (K, S)."""
+    """The input of each substep, leading axes (K, S)."""
     innovations: dict[str, Innovation]
     """By sensor: leading axes (K, S) for fast sensors, (K,) for slow ones. Empty unless kept."""
 
 
 def initial_belief(model: Model, params: Parameters, first: Mapping[str, Any]) -> Belief:
-    """The belief a run starts from: mean from its first samples, covariance from the parameters."""
+    """The belief at the start of a run: mean from its first samples, covariance from the parameters."""
     return Belief(model.initial_mean(first), model.initial_covariance(params))
 
 
@@ -113,18 +113,33 @@ def run_filter(
 ) -> FilterOutput:
     """Filter one run from an initial belief; differentiable in everything, and fast under `vmap`.
 
-    `keep` says what is kept of each substep: ``everything``, ``estimates`` (updated beliefs) or
-    ``means``, besides log-likelihoods; what is not kept costs neither time nor memory. Reverse
-    derivatives are taken by the closed-form adjoint, several times faster than JAX's own; it has no
-    forward mode (forward over reverse is fine). With ``adjoint=False`` all derivatives are JAX's own.
-    For the reverse pass a few beliefs are kept and the others computed again, unless `checkpoint` is
-    False, which keeps all. `refused` is `Instant.refused` of where an earlier part of the run ended.
-    `relinearise` further linearisations of every update go about where it arrived, with the
-    prediction's covariance as the prior throughout (iterated extended Kalman filter,
-    `jaxekf.filtering._iterated_update`); gates, weights, innovations and likelihood are those of the
-    first.
+    Parameters
+    ----------
+    model, params, belief, steps
+        The model, its parameters, the belief at the start, and the samples and inputs of the run.
+    keep
+        Results of each substep besides log-likelihoods: ``everything``, ``estimates`` (updated beliefs) or
+        ``means``. Results that are not kept cost neither time nor memory.
+    adjoint
+        Whether reverse derivatives are the closed-form adjoint, several times faster than JAX's own. The
+        adjoint has no forward mode (forward over reverse is fine). False takes JAX's own derivatives.
+    checkpoint
+        Whether the reverse pass keeps a few beliefs and computes the others again. False keeps all.
+    refused
+        `Instant.refused` at the end of an earlier part of the run.
+    relinearise
+        Number of further linearisations of every update, each about the result of the one before, with the
+        prediction's covariance as the prior (iterated extended Kalman filter). Gates, weights, innovations
+        and likelihood are those of the first.
 
-    Raises `ModelError` for an unknown `keep`, and where forward mode meets the adjoint.
+    Returns
+    -------
+    `FilterOutput`, leading axes (K, S).
+
+    Raises
+    ------
+    ModelError
+        For an unknown `keep`, and for a forward-mode derivative of the adjoint.
 
     Examples
     --------
@@ -158,47 +173,72 @@ def run_filter_batch(
 ) -> FilterOutput:
     """Filter many runs side by side: every leaf of every argument carries the runs on its first axis.
 
-    Equal to `vmap` of `run_filter`, and to calls of it one by one; options as there. With several
-    `devices` the runs are shared among them; CPU cores are devices where JAX's `jax_num_cpu_devices`
-    was set before its first use.
+    Equal to `vmap` of `run_filter`, and to calls of it one by one.
 
-    Raises `ModelError` as `run_filter` does, and where there is no run or no step.
+    Parameters
+    ----------
+    model, params, belief, steps, keep, adjoint, checkpoint, refused, relinearise
+        As in `run_filter`.
+    devices
+        Devices that share the runs. CPU cores are devices if JAX's `jax_num_cpu_devices` was set before its
+        first use.
+
+    Returns
+    -------
+    `FilterOutput`, leading axes (runs, K, S).
+
+    Raises
+    ------
+    ModelError
+        As `run_filter`, and for no run or no step.
     """
-    if keep not in _KEPT:
+    if keep not in _SAVE_SPECS:
         raise ModelError(
-            f"got keep='{keep}', expected one of {sorted(_KEPT)}; choose what is to be kept"
+            f"got keep='{keep}', expected one of {sorted(_SAVE_SPECS)}; choose what is to be kept"
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
-    ready, prepared, given = made_ready(model, params, belief, steps, relinearise)
-    inputs = given.moments.u
-    what = _KEPT[keep]
+    lowered, prepared, inputs = lower_model(model, params, belief, steps, relinearise)
+    u = inputs.substeps.u
+    save, first = _SAVE_SPECS[keep], ScanInit(belief, refused)
     if adjoint:
         runs, epochs, substeps = steps.dt.shape
-        kept_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
-        lanes = min(runs, blocks.LANES)
-        segment = recursion.segment_length(epochs, substeps, kept_bytes * lanes)
+        belief_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
+        lanes = min(runs, batching.LANES)
+        segment = recursion.segment_length(epochs, substeps, belief_bytes * lanes)
         if not checkpoint:
             segment = 1
-        moving = reverse_only((prepared, First(belief, refused), given))
-        kept = recursion.filter_with_adjoint(ready, what, segment, tuple(devices), *moving)
+        trees = reverse_only((prepared, first, inputs))
+        kept = recursion.filter_with_adjoint(lowered, save, segment, tuple(devices), *trees)
     else:
-        first = First(belief, refused)
-        kept = recursion.filter_plainly(ready, what, checkpoint, prepared, first, given)
+        kept = recursion.filter_with_jax_derivatives(
+            lowered, save, checkpoint, prepared, first, inputs
+        )
     updated: Any = Updated(kept.mean, kept.cov) if kept.cov is None else Belief(kept.mean, kept.cov)
     instants = Instant(
         kept.prior, updated, kept.log_likelihood, kept.healthy, kept.recovered, kept.refused
     )
-    innovations = _innovations(model, params, inputs, steps, kept) if what.used else {}
-    return FilterOutput(instants, inputs, innovations)
+    innovations = _innovations(model, params, u, steps, kept) if save.used else {}
+    return FilterOutput(instants, u, innovations)
 
 
-def made_ready(
+def lower_model(
     model: Model, params: Parameters, belief: Belief, steps: Steps, relinearise: int = 0
-) -> tuple[lowered_model.System, Any, Given]:
-    """The model on lanes, what its steps need of the parameters, and what they are driven with; all
-    arguments and the last two results carry the runs on the first axis.
+) -> tuple[LoweredModel, Any, ScanInputs]:
+    """Prepare a model and many runs for the scan; arguments carry the runs on the first axis.
 
-    Raises `ModelError` where there is no run or no step, or for a negative number of linearisations.
+    Returns
+    -------
+    lowered
+        The model on the batch axis.
+    prepared
+        The result of `LoweredModel.prepare`, runs first.
+    inputs
+        The scan's inputs, runs first.
+
+    Raises
+    ------
+    ModelError
+        For no run, no step, or a negative number of linearisations.
     """
     if relinearise < 0:
         raise ModelError(
@@ -209,25 +249,38 @@ def made_ready(
             f"got steps of shape {steps.dt.shape} (runs, epochs, substeps), expected at least one of"
             " each; leave out runs without data"
         )
-    inputs = jax.vmap(partial(inputs_of, model))(params, steps)
-    sizes: Any = one_sample((params, belief.mean), 1)
-    u, fast = one_sample((inputs, steps.fast), 3)
-    spec = (model, sizes[0], sizes[1], u, fast | one_sample(steps.slow, 2))
-    ready = lowered_model.build(*spec)
+    u = jax.vmap(partial(inputs_of, model))(params, steps)
+    inputs = ScanInputs(SubstepInput(steps.dt, u), steps.fast, steps.slow)
+    return *lower_for_inputs(model, params, belief, inputs, AT_ESTIMATE, relinearise), inputs
+
+
+def lower_for_inputs(
+    model: Model,
+    params: Parameters,
+    belief: Belief,
+    inputs: ScanInputs,
+    linearise: Linearisation,
+    relinearise: int = 0,
+) -> tuple[LoweredModel, Any]:
+    """`lowered` and `prepared` as in `lower_model`, for any linearisation."""
+    sizes: Any = _one_sample((params, belief.mean), 1)
+    u, fast = _one_sample((inputs.substeps.u, inputs.fast), 3)
+    spec = (model, sizes[0], sizes[1], u, fast | _one_sample(inputs.slow, 2))
+    lowered = lowered_model.build(*spec, linearise)
     if relinearise:
-        more = again(lowered_path.build(*spec), relinearise)
-        ready = with_again(ready, more)
-    prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
-    return ready, prepared, Given(Moment(steps.dt, inputs), steps.fast, steps.slow)
+        about_path = lowered_model.build(*spec, ABOUT_PATH)
+        lowered = with_iterated_update(lowered, about_path, relinearise)
+    runs = inputs.substeps.dt.shape[0]
+    return lowered, jax.vmap(lowered.prepare, axis_size=runs)(params)
 
 
-def one_sample(tree: Any, axes: int) -> Any:
+def _one_sample(tree: Any, axes: int) -> Any:
     """Shape and type of one sample of arrays with `axes` leading axes."""
     return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[axes:], a.dtype), tree)
 
 
 def inputs_of(model: Model, params: Parameters, steps: Steps) -> InputSample | None:
-    """The input of every substep of one run, its clock shifted as the calibration says."""
+    """The input of every substep of one run, its clock shifted by the calibration; None without input."""
     if model.input is None or steps.knots is None:
         return None
     shift = partial(model.input.shift, params)
@@ -235,9 +288,9 @@ def inputs_of(model: Model, params: Parameters, steps: Steps) -> InputSample | N
 
 
 def _innovations(
-    model: Model, params: Parameters, inputs: Any, steps: Steps, kept: Kept
+    model: Model, params: Parameters, inputs: Any, steps: Steps, kept: ScanOutputs
 ) -> dict[str, Innovation]:
-    """Every sensor's innovations from the predicted beliefs, for all runs and instants at once."""
+    """The innovations of every sensor from the predicted beliefs, for all runs and instants at once."""
     found = {}
     for name, rows in (steps.fast | steps.slow).items():
         fast = name in steps.fast
@@ -248,13 +301,12 @@ def _innovations(
         one = partial(_innovation, model, model.sensor(name))
         for _ in range(2 if fast else 1):
             one = jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0))
-        given = (prior, u, rows, kept.used[name], kept.gated[name])
-        found[name] = jax.vmap(one)(params, *given)
+        found[name] = jax.vmap(one)(params, prior, u, rows, kept.used[name], kept.gated[name])
     return found
 
 
 def _nis(residual: Array, cov: Array) -> Array:
-    """``r' inv(S) r``; of many rows by LAPACK, for written out they would take minutes to compile."""
+    """``r' inv(S) r``; many rows by LAPACK, since unrolled arithmetic would take minutes to compile."""
     if residual.shape[0] <= _MANY_ROWS:
         return linalg.squared_distance(residual, cov)
     white = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(cov), residual, lower=True)
@@ -271,14 +323,14 @@ def _innovation(
     used: Array,
     gated: Array,
 ) -> Innovation:
-    """One sensor's innovation at one instant."""
+    """The innovation of one sensor at one instant of one run."""
     residual, jacobian, noise = linearise_sensor(model, sensor, params, prior.mean, u, rows)
     jacobian = jnp.where(rows.mask[:, None], jacobian, 0.0)
     spread = linalg.multiply_transposed(linalg.multiply(jacobian, prior.cov), jacobian)
     noise = linalg.mask_covariance(noise, rows.mask)
     cov = linalg.symmetrise(spread + noise)
     nis = _nis(residual, cov)
-    weight = gating.weights(sensor, residual, cov, rows.mask)
+    weight = gating.row_weights(sensor, residual, cov, rows.mask)
     if weight is not None:
         weight = jnp.where(used, weight, 0.0)
     return Innovation(jnp.where(used, residual, 0.0), cov, used, gated, nis, weight)

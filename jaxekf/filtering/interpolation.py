@@ -10,7 +10,7 @@ from jaxekf.filtering.steps import Knots
 
 
 class InputSample(NamedTuple):
-    """What the transition, the sensors and the outputs see of the input."""
+    """The input of one step, as transition, sensors and outputs get it."""
 
     mean: Any
     """Mean of the linearly interpolated input over the step, (c,)."""
@@ -23,18 +23,30 @@ class InputSample(NamedTuple):
 def sample(
     knots: Knots, time: Array, dt: Array, shift: Callable[[Array], Array] = jnp.zeros_like
 ) -> InputSample:
-    """The input over each ``[time - dt, time]``, shapes (K, S), on its own clock, which is ``shift(time)``
-    seconds ahead.
+    """The input over each ``[time - dt, time]`` of the timeline.
 
-    The mean is the difference of the running integral at the two ends, by the time between them on the
-    input's clock; it is continuously differentiable in the shift. Beyond the first and last knot the input
-    is held.
+    The mean is the difference of the running integral at the two ends, divided by the time between them on
+    the input's clock; it is continuously differentiable in the shift. Beyond the first and last knot the
+    input is held.
+
+    Parameters
+    ----------
+    knots
+        The sampled input.
+    time, dt
+        (K, S) seconds.
+    shift
+        ``shift(time)``: seconds by which the input's clock is ahead of the timeline.
+
+    Returns
+    -------
+    `InputSample`, leading axes (K, S).
     """
     late, early = shift(time), shift(time - dt)
     value, integral, bandwidth = _evaluate(knots, time + late)
     _, before, _ = _evaluate(knots, time - dt + early)
     moving = (dt > 0.0)[..., None]
-    # Not the difference of the two ends, whose digits a long run has used up.
+    # Not the difference of the two end times: in a long run it has lost its last digits.
     step = jnp.where(moving, (dt + (late - early))[..., None], 1.0)
     return InputSample(jnp.where(moving, (integral - before) / step, value), value, bandwidth)
 

@@ -4,9 +4,9 @@ It minimises over the start and all process noise
 
     |local(x0, start)|^2 / P0 + sum |w|^2 / Q + sum |local(h(x), z)|^2 / R
 
-with ``x = transition(x before, u, dt, w)``. Each iteration is one linear Kalman filter and one pass back
-about the path so far; the path may miss the transition while it is on its way, and does not where it has
-arrived. Rows that the filter's gates refused count no more.
+with ``x = transition(x before, u, dt, w)``. Each iteration is a linear Kalman filter and a backward pass
+about the present path. The path may miss the transition while the iteration runs (its defect is not zero),
+and satisfies it at convergence. Rows that the filter's gates rejected do not count.
 """
 
 from collections.abc import Sequence
@@ -18,21 +18,20 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxekf._support.errors import ModelError
-from jaxekf.filtering import _covariance_algebra as covariance_algebra
-from jaxekf.filtering import _lowered_path as lowered_path
+from jaxekf.filtering import _covariance_prediction as covariance_prediction
 from jaxekf.filtering import _smoother_pass as smoother_pass
 from jaxekf.filtering import _step as step
 from jaxekf.filtering import _substeps as substeps
 from jaxekf.filtering import ekf, smoother
-from jaxekf.filtering._covariance_algebra import Gained
-from jaxekf.filtering._gating import Linear
-from jaxekf.filtering._iterated_update import turned
-from jaxekf.filtering._lowered_path import AboutSystem
-from jaxekf.filtering._recursion import Given
+from jaxekf.filtering._covariance_update import UpdateAccumulator
+from jaxekf.filtering._epoch import ScanInputs
+from jaxekf.filtering._lowered_model import ABOUT_PATH, BoundModel, LoweredModel
 from jaxekf.filtering._smoother_pass import Information
-from jaxekf.filtering._step import Moment
-from jaxekf.filtering.lowering import batched_vjp, structured_matrix
-from jaxekf.filtering.lowering.lanes import stage
+from jaxekf.filtering._step import SubstepInput
+from jaxekf.filtering.lowering import structured_matrix
+from jaxekf.filtering.lowering.batched_products import congruence, multiply_vector
+from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp
+from jaxekf.filtering.lowering.lanes import materialise
 from jaxekf.filtering.lowering.reverse_only import reverse_only
 from jaxekf.filtering.model import Belief, Model, Parameters
 from jaxekf.filtering.smoother import SmootherOutput
@@ -41,10 +40,12 @@ from jaxekf.geometry import linalg
 
 
 class Path(NamedTuple):
-    """A path through a run: the start, and at every substep, leading axes (K, S), state and noise."""
+    """A path through a run; leading axes (K, S) except for the start."""
 
     start: Any
+    """State at the start of the run."""
     mean: Any
+    """State at the end of each substep."""
     noise: Array
     """(K, S, n_w) process noise of the transition that ends there."""
 
@@ -53,7 +54,7 @@ class IteratedOutput(NamedTuple):
     """A run smoothed by iteration."""
 
     filtered: Any
-    """All that the filter left, linearised at its own estimates."""
+    """The filter's results, linearised at its own estimates."""
     smoothed: Belief
     """At the end of each substep, leading axes (K, S)."""
     start: Belief
@@ -61,16 +62,18 @@ class IteratedOutput(NamedTuple):
     noise: Array
     """(K, S, n_w) the process noise that carries the path from each substep to the next."""
     moved: Array
-    """(iterations,) the longest move of a state in each, in standard deviations of the smoothed one:
-    small at the end where the iteration has converged."""
+    """(iterations,) the largest step of a state in each iteration, in standard deviations of the smoothed
+    state: small in the last ones if the iteration has converged."""
 
 
-class _Forward(NamedTuple):
-    """What the pass ahead leaves at a substep: errors counted from the path."""
+class _ForwardOutput(NamedTuple):
+    """The forward pass at one substep: errors relative to the path."""
 
-    prior: Gained
+    prior: UpdateAccumulator
     delta: Array
+    """(n, lanes) after the update."""
     cov: Array
+    """(n, n, lanes) after the update."""
 
 
 def run_iterated_smoother(
@@ -84,9 +87,9 @@ def run_iterated_smoother(
 ) -> IteratedOutput:
     """The most probable path of one run, from an initial belief; differentiable in everything.
 
-    It begins at the smoothed path; samples that the filter's gates refused stay refused. Of the
-    `iterations` of Gauss and Newton 3 to 5 are plenty for a tracker: look at `moved`. Options as in
-    `run_smoother`.
+    The iteration starts at the smoothed path; samples that the filter's gates rejected stay rejected. For a
+    tracker 3 to 5 `iterations` of Gauss-Newton suffice; `IteratedOutput.moved` shows whether they did. The
+    other arguments are those of `run_smoother`.
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
     found = run_iterated_smoother_batch(model, *one, iterations=iterations, adjoint=adjoint)
@@ -103,10 +106,13 @@ def run_iterated_smoother_batch(
     adjoint: bool = True,
     devices: Sequence[Any] = (),
 ) -> IteratedOutput:
-    """Many runs: every leaf of every argument carries the runs on its first axis, `moved` too.
+    """The most probable paths of many runs: every leaf of every argument and result carries the runs first.
 
-    Raises `ModelError` for a model with heavy-tailed sensors (`jaxekf.robust`), and as
-    `run_smoother_batch`.
+    Raises
+    ------
+    ModelError
+        For a model with robust weighting (`jaxekf.robust` with huber or student), and as
+        `run_smoother_batch`.
     """
     if any(sensor.weighting is not None for sensor in model.sensors):
         raise ModelError(
@@ -117,187 +123,166 @@ def run_iterated_smoother_batch(
     first = smoother.run_smoother_batch(
         model, params, belief, steps, adjoint=adjoint, devices=devices
     )
-    given = _used(first, steps)
-    sample: Any = ekf.one_sample((given.moments.u, given.fast), 3)
-    rows = sample[1] | ekf.one_sample(given.slow, 2)
-    sizes: Any = ekf.one_sample((params, belief.mean), 1)
-    ready = lowered_path.build(model, sizes[0], sizes[1], sample[0], rows)
-    prepared = jax.vmap(ready.prepare, axis_size=steps.dt.shape[0])(params)
-    noise_dim = ready.transition.noise.shape[1]
+    inputs = _used_inputs(first, steps)
+    lowered, prepared = ekf.lower_for_inputs(model, params, belief, inputs, ABOUT_PATH)
+    noise_dim = lowered.transition.g_pattern.shape[1]
     dtype = belief.cov.dtype
     path = Path(
         first.start.mean, first.smoothed.mean, jnp.zeros((*steps.dt.shape, noise_dim), dtype)
     )
-    trees = (prepared, belief, given)
+    trees = (prepared, belief, inputs)
     if adjoint:
-        function = _lanes(ready, tuple(devices))
+        function = _gauss_newton_with_vjp(lowered, tuple(devices))
         trees = reverse_only(trees)
     else:
-        function = partial(batched_vjp.on_lanes, partial(_iteration, ready, False))
+        function = partial(batched, partial(_gauss_newton_step, lowered, False))
 
     def iterate(carry: Any, _: None) -> Any:
-        path, smoothed, start, longest = function(*trees, carry[0])
-        return (path, smoothed, start), longest
+        path, smoothed, start, largest = function(*trees, carry[0])
+        return (path, smoothed, start), largest
 
     begun = (path, Belief(*first.smoothed), Belief(*first.start))
     (path, smoothed, start), moved = lax.scan(iterate, begun, None, length=iterations)
     return IteratedOutput(first.filtered, smoothed, start, path.noise, jnp.moveaxis(moved, 0, 1))
 
 
-def _used(first: SmootherOutput, steps: Steps) -> Given:
-    """What the filter was driven with, only rows that entered an update visible."""
+def _used_inputs(first: SmootherOutput, steps: Steps) -> ScanInputs:
+    """The filter's inputs, with only the rows visible that entered its updates."""
     used = first.filtered.innovations
 
-    def seen(sensors: Any) -> Any:
+    def mask_unused(sensors: Any) -> Any:
         return {name: rows._replace(mask=used[name].used) for name, rows in sensors.items()}
 
-    moments = Moment(steps.dt, first.filtered.inputs)
-    return Given(moments, seen(steps.fast), seen(steps.slow))
+    own = SubstepInput(steps.dt, first.filtered.inputs)
+    return ScanInputs(own, mask_unused(steps.fast), mask_unused(steps.slow))
 
 
 @lru_cache(maxsize=64)
-def _lanes(system: AboutSystem, devices: tuple[Any, ...]) -> Any:
-    return batched_vjp.with_own_derivative(devices, partial(_iteration, system, True))
+def _gauss_newton_with_vjp(lowered: LoweredModel, devices: tuple[Any, ...]) -> Any:
+    return batched_with_vjp(devices, partial(_gauss_newton_step, lowered, True))
 
 
-# --- one block of runs, on lanes ----------------------------------------------------------------------
+# --- one batch of runs, on the batch axis -------------------------------------------------------------
 
 
-class _Place(NamedTuple):
-    """A substep of the path."""
+class _PathSubstep(NamedTuple):
+    """One substep of the path."""
 
-    moment: Moment
+    substep: SubstepInput
     before: Any
+    """State at the end of the substep before."""
     after: Any
+    """State at its own end."""
     noise: Array
+    """(n_w, lanes) process noise."""
 
 
-def _iteration(
-    system: AboutSystem, adjoint: bool, prepared: Any, belief: Belief, given: Given, path: Path
+def _gauss_newton_step(
+    lowered: LoweredModel,
+    adjoint: bool,
+    prepared: Any,
+    belief: Belief,
+    inputs: ScanInputs,
+    path: Path,
 ) -> tuple[Path, Belief, Belief, Array]:
-    """One step of Gauss and Newton: the path after it, the beliefs about it, and the longest move."""
-    away, changed = system.start(prepared["start"], belief.mean, path.start, adjoint=adjoint)
-    delta = -stage(covariance_algebra.apply(changed, away))
-    cov = turned(changed, belief.cov)
-    before = jax.tree.map(smoother_pass.one_earlier, path.start, path.mean)
-    places = _Place(given.moments, before, path.mean, path.noise)
-    ahead = partial(_epoch_ahead, system, adjoint, prepared)
-    _, forward = lax.scan(ahead, (delta, cov), (places, given.fast, given.slow))
+    """One iteration: the new path, the beliefs about it at every substep and at the start, and the largest
+    step (lanes,)."""
+    bound = lowered.bind(prepared, adjoint=adjoint)
+    error, jacobian = bound.prior(belief.mean, path.start)
+    delta = -materialise(multiply_vector(jacobian, error))
+    cov = congruence(jacobian, belief.cov)
+    before = jax.tree.map(smoother_pass.shift_by_one, path.start, path.mean)
+    own = _PathSubstep(inputs.substeps, before, path.mean, path.noise)
+    filter_epoch = partial(_filter_epoch, bound)
+    _, forward = lax.scan(filter_epoch, (delta, cov), (own, inputs.fast, inputs.slow))
     nothing = Information(jnp.zeros_like(delta), jnp.zeros_like(cov))
-    back = partial(_epoch_back, system, adjoint, prepared)
-    every = (places, given.fast, given.slow, forward)
-    info, (found, noise, longest) = lax.scan(back, nothing, every, reverse=True)
-    start, first = _moved(system, prepared, path.start, delta, cov, info, adjoint)
-    farthest = jnp.maximum(jnp.max(longest, axis=(0, 1)), first)
-    return Path(start.mean, found.mean, noise), found, start, farthest
+    smooth_epoch = partial(_smooth_epoch, bound)
+    epochs = (own, inputs.fast, inputs.slow, forward)
+    info, (found, noise, largest) = lax.scan(smooth_epoch, nothing, epochs, reverse=True)
+    start, first = _move_state(bound, path.start, delta, cov, info)
+    largest = jnp.maximum(jnp.max(largest, axis=(0, 1)), first)
+    return Path(start.mean, found.mean, noise), found, start, largest
 
 
-def _linear(
-    system: AboutSystem, prepared: Any, place: _Place, samples: Any, adjoint: bool
-) -> list[Linear]:
-    """The samples of an instant linearised at the path."""
-    linear = {}
-    for name, sample in samples.items():
-        measurement = system.measurements[name]
-        found = measurement(
-            prepared[f"sensor {name}"], place.after, place.moment.u, sample, adjoint=adjoint
-        )
-        linear[name] = step.hide(measurement, *found, sample.mask)
-    return list(linear.values())
-
-
-def _transition(system: AboutSystem, prepared: Any, place: _Place, adjoint: bool) -> Any:
-    """How far the path misses the transition, the bands of F and G, and the noise."""
-    dt = place.moment.dt
-    (sigma,) = system.transition.sigma(prepared["process noise"], dt, adjoint=adjoint)
-    found = system.transition.piece(
-        prepared["transition"],
-        place.before,
-        place.after,
-        place.noise,
-        place.moment.u,
-        dt,
-        adjoint=adjoint,
-    )
+def _linearise_transition(bound: BoundModel, own: _PathSubstep) -> Any:
+    """The defect of the path, the bands of F and G, and the process noise."""
+    sigma = bound.process_noise(own.substep.dt)
+    found = bound.transition(own.before, own.after, own.noise, own.substep.u, own.substep.dt)
     return *found, sigma
 
 
-def _ahead(
-    system: AboutSystem, prepared: Any, carry: Any, place: _Place, samples: Any, adjoint: bool
-) -> tuple[Any, _Forward]:
+def _filter_substep(
+    bound: BoundModel, carry: Any, own: _PathSubstep, samples: Any
+) -> tuple[Any, _ForwardOutput]:
     """The linear filter over one substep."""
     delta, cov = carry
-    transition = system.transition
-    missed, f, g, sigma = _transition(system, prepared, place, adjoint)
-    forth = stage(structured_matrix.multiply(transition.state, f, delta))
-    back = stage(structured_matrix.multiply(transition.noise, g, place.noise))
-    cov = covariance_algebra.predicted(transition.state, transition.noise, f, g, cov, sigma)
-    prior = Gained(cov, missed + forth - back, jnp.zeros_like(delta[0]))
-    gained = prior
-    for one in _linear(system, prepared, place, samples, adjoint):
-        gained = step.take_block(one.slope, gained, one.rows, False)[0]
-    cov = linalg.symmetrise(gained.cov)
-    return (gained.delta, cov), _Forward(prior, gained.delta, cov)
+    transition = bound.lowered.transition
+    defect, f, g, sigma = _linearise_transition(bound, own)
+    forth = materialise(structured_matrix.multiply(transition.f_pattern, f, delta))
+    back = materialise(structured_matrix.multiply(transition.g_pattern, g, own.noise))
+    patterns = (transition.f_pattern, transition.g_pattern)
+    cov = covariance_prediction.predicted_covariance(patterns, f, g, cov, sigma)
+    prior = UpdateAccumulator(cov, defect + forth - back, jnp.zeros_like(delta[0]))
+    accumulator = prior
+    linear = step.linearise(bound, own.after, own.substep.u, samples)
+    for one in linear.values():
+        accumulator, _ = step.apply_sensor(one, accumulator, adjoint=False)
+    cov = linalg.symmetrise(accumulator.cov)
+    return (accumulator.delta, cov), _ForwardOutput(prior, accumulator.delta, cov)
 
 
-def _epoch_ahead(
-    system: AboutSystem, adjoint: bool, prepared: Any, carry: Any, at: Any
-) -> tuple[Any, _Forward]:
-    places, fast, slow = at
+def _filter_epoch(bound: BoundModel, carry: Any, epoch_inputs: Any) -> tuple[Any, _ForwardOutput]:
+    own, fast, slow = epoch_inputs
 
-    def substep(carry: Any, at: Any) -> tuple[Any, _Forward]:
-        place, samples = at
-        return _ahead(system, prepared, carry, place, samples, adjoint)
+    def substep(carry: Any, substep_inputs: Any) -> tuple[Any, _ForwardOutput]:
+        return _filter_substep(bound, carry, *substep_inputs)
 
-    return substeps.over_substeps(substep, carry, (places, fast), slow)
+    return substeps.scan_substeps(substep, carry, (own, fast), slow)
 
 
-def _epoch_back(
-    system: AboutSystem, adjoint: bool, prepared: Any, info: Information, at: Any
+def _smooth_epoch(
+    bound: BoundModel, info: Information, epoch_inputs: Any
 ) -> tuple[Information, Any]:
-    places, fast, slow, forward = at
+    own, fast, slow, forward = epoch_inputs
 
-    def substep(info: Information, at: Any) -> tuple[Information, Any]:
-        (place, forward), samples = at
-        found = _moved(system, prepared, place.after, forward.delta, forward.cov, info, adjoint)
-        gained = forward.prior
-        taken = []
-        for one in _linear(system, prepared, place, samples, adjoint):
-            gained, kept = step.take_keeping(one.slope, gained, one.rows)
-            taken.append((covariance_algebra.pattern_taken(one.slope, one.rows), kept))
-        for slope, kept in reversed(taken):
-            info = smoother_pass.before_rows(slope, kept, info)
-        info, noise = _before(system, prepared, place, info, adjoint)
-        return info, (found[0], noise, found[1])
+    def substep(info: Information, substep_inputs: Any) -> tuple[Information, Any]:
+        (own, forward), samples = substep_inputs
+        belief, largest = _move_state(bound, own.after, forward.delta, forward.cov, info)
+        accumulator = forward.prior
+        applied = []
+        for one in step.linearise(bound, own.after, own.substep.u, samples).values():
+            accumulator, saved = step.apply_sensor_saving(one, accumulator)
+            applied.append(saved)
+        for saved in reversed(applied):
+            info = smoother_pass.information_before_rows(saved, info)
+        info, noise = _information_before_transition(bound, own, info)
+        return info, (belief, noise, largest)
 
-    return substeps.over_substeps_back(substep, info, ((places, forward), fast), slow)
+    return substeps.scan_substeps_backward(substep, info, ((own, forward), fast), slow)
 
 
-def _before(
-    system: AboutSystem, prepared: Any, place: _Place, info: Information, adjoint: bool
+def _information_before_transition(
+    bound: BoundModel, own: _PathSubstep, info: Information
 ) -> tuple[Information, Array]:
     """The information before a transition, and the most probable process noise of it, ``Q G' a``."""
-    transition = system.transition
-    _, f, g, sigma = _transition(system, prepared, place, adjoint)
-    turned = structured_matrix.transpose(g)
-    drawn = stage(structured_matrix.multiply(transition.noise.transposed, turned, info.vector))
-    noise = sigma * drawn if transition.diagonal else stage(covariance_algebra.apply(sigma, drawn))
-    return smoother_pass.carried(transition.state, f, info), noise
+    transition = bound.lowered.transition
+    _, f, g, sigma = _linearise_transition(bound, own)
+    transposed = structured_matrix.transpose_bands(g)
+    back = transition.g_pattern.transposed
+    drawn = materialise(structured_matrix.multiply(back, transposed, info.vector))
+    is_diagonal = transition.has_diagonal_noise
+    noise = sigma * drawn if is_diagonal else materialise(multiply_vector(sigma, drawn))
+    return smoother_pass.pull_back(transition.f_pattern, f, info), noise
 
 
-def _moved(
-    system: AboutSystem,
-    prepared: Any,
-    mean: Any,
-    delta: Array,
-    cov: Array,
-    info: Information,
-    adjoint: bool,
+def _move_state(
+    bound: BoundModel, mean: Any, delta: Array, cov: Array, info: Information
 ) -> tuple[Belief, Array]:
-    """A state of the path moved to where it is most probable, its covariance counted from there, and how
-    many standard deviations it moved."""
-    delta = delta + stage(covariance_algebra.apply(cov, info.vector))
-    cov = smoother_pass.lessened(cov, info.matrix)
-    longest = lax.stop_gradient(jnp.max(jnp.abs(delta) / jnp.sqrt(linalg.diagonal(cov)), axis=0))
-    moved, reset = system.move(prepared["move"], mean, delta, adjoint=adjoint)
-    return Belief(moved, turned(reset, cov)), longest
+    """A state of the path moved to its most probable value, with its covariance there; and the size of the
+    step in standard deviations, (lanes,)."""
+    delta = delta + materialise(multiply_vector(cov, info.vector))
+    cov = smoother_pass.smoothed_covariance(cov, info.matrix)
+    deviations = jnp.abs(delta) / jnp.sqrt(linalg.diagonal(cov))
+    largest = lax.stop_gradient(jnp.max(deviations, axis=0))
+    moved, reset = bound.retraction(mean, delta)
+    return Belief(moved, congruence(reset, cov)), largest

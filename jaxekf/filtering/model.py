@@ -1,8 +1,8 @@
-"""What an estimator is told: models and sensors as data.
+"""Models and sensors as data: the description of a system that the filter estimates.
 
 A model is a state space, a transition with its process noise, sensors, outputs and default
 parameters. It is written for one run, one step and one sample; the filter differentiates it, scans
-it over time and maps it over runs. Nothing here knows a particular model.
+it over time and maps it over runs. The built-in models are in `jaxekf.models`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.deprecations import renamed_fields
 from jaxekf._support.errors import ModelError
 from jaxekf.geometry import manifold
 from jaxekf.recordings.types import Recording, Samples
@@ -26,33 +27,33 @@ Source = Callable[[Recording], Samples]
 
 
 class Start(NamedTuple):
-    """Where a run starts, and what is known there."""
+    """The start of a run."""
 
     time_ns: int
     first: dict[str, Any]
-    """What `Model.initial_mean` is given."""
+    """The argument of `Model.initial_mean`."""
     note: str = ""
-    """What a user should be told about the start; empty where there is nothing to say."""
+    """A note on the start for the user; empty for none."""
 
 
 FindStart = Callable[[Recording, Mapping[str, Samples]], Start | None]
 
 
 class Parameters(NamedTuple):
-    """Everything a run is estimated with that is not data: pytrees of arrays, so they have gradients."""
+    """The parameters of a model: pytrees of arrays, all differentiable."""
 
     noise: Any
     """Standard deviations or spectral densities; shape () for all axes, (d,) for each axis, or a
     lower-triangular factor (d, d)."""
     calibration: Any
-    """Clock offset, alignment, scale, lever arm, latency: what is not noise."""
+    """Clock offset, alignment, scale, lever arm, latency."""
     initial: Any
     """Standard deviations of the initial belief."""
     setup: Any = ()
-    """What a recording itself tells of its run and nobody tunes: marker geometry, gravity, frames."""
+    """Constants of the recording that are not tuned: marker geometry, gravity, frames."""
     truth: Any = ()
-    """How the encoder's clock and frames lie to the tracker's, where a tuner is to find that: no estimate
-    depends on it, only what it is compared with."""
+    """Clock offset and rotations between encoder and tracker, for a tuner that estimates them. They change
+    the reference that an estimate is compared with, not the estimate."""
 
 
 class Belief(NamedTuple):
@@ -78,23 +79,22 @@ class Sensor:
     """``noise(params, aux, dt)``: covariance (rows, rows) of a sample; ``dt`` is the sensor's own
     sampling period in seconds."""
     source: Source | None = None
-    """Where a recording holds the samples; None for a sensor that is fed from arrays only."""
+    """``source(recording)``: the samples; None for a sensor that gets its samples as arrays only."""
     groups: tuple[int, ...] | None = None
-    """Group of each row; a gate accepts or rejects a group whole. None puts all rows in one group."""
+    """Group of each row; a gate accepts or rejects all rows of a group. None puts all rows in one group."""
     gate: float | None = None
-    """Probability with which a good group passes the chi-square gate; None for no gate."""
+    """Probability with which a Gaussian group passes the chi-square gate; None for no gate."""
     weighting: Literal["huber", "student"] | None = None
-    """Law of heavy tails by which a group counts less the farther it is off; None for none. The
-    likelihood is then that of the noise so enlarged."""
+    """Robust weighting (Huber or Student-t): the noise of a group grows with its innovation, and the
+    likelihood is that of the inflated noise. None for none."""
     aux_like: Any = None
-    """Auxiliary data of an ordinary sample, where it needs any: for samples that come without."""
+    """Typical auxiliary data, used for samples that come without; None if `predict` needs none."""
     alike: "Sensor | None" = None
-    """One of the groups that a sample is made of, as a sensor of its own, where all are alike and many; see
-    `repeated`. None for a sensor whose sample is one thing."""
+    """One group as a sensor, if the sample consists of many equal groups; see `repeated`."""
 
     @property
     def copies(self) -> int:
-        """Number of groups of a sample that is made of like ones; 1 for any other."""
+        """Number of equal groups that a sample consists of; 1 for a sensor that is not `repeated`."""
         return 1 if self.alike is None else self.rows // self.alike.rows
 
     @property
@@ -116,11 +116,22 @@ def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
     """A sensor whose sample is `count` samples of `one`, such as all points of an image.
 
     Value, rows and covariance are those of all groups one after the other; every leaf of `aux` has the
-    groups on its first axis. Each is gated, or counts less, by itself, and what the filter compiles
-    does not grow with their number. Gate, weighting and source are those of `one`, whose space must be
-    `Euclidean`; `labels` are those of all rows.
+    groups on its first axis. Each group has its own gate or weight. The compiled size does not grow with
+    the number of groups.
 
-    Raises `ModelError` for another space, for no group, or for a number of labels that is not the rows'.
+    Parameters
+    ----------
+    one
+        Sensor of one group, in a `Euclidean` space; gives gate, weighting and source.
+    count
+        Number of groups.
+    labels
+        Labels of all rows; none keeps the default ones.
+
+    Raises
+    ------
+    ModelError
+        For another space, for no group, or if the number of labels is not the number of rows.
     """
     if not isinstance(one.space, manifold.Euclidean) or one.alike is not None or count < 1:
         raise ModelError(
@@ -151,31 +162,31 @@ def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """A quantity users ask for that follows from the state, with its uncertainty."""
+    """A quantity computed from the state, with its uncertainty."""
 
     name: str
     space: Any
     frame: str
-    """Frame in which the error vector, and so the covariance, is counted."""
+    """Frame of the error vector and its covariance."""
     value: Callable[[Any, Any, Parameters], Any]
     """``value(x, u, params)``; ``u`` is the input at that instant."""
     noise: Callable[[Any, Parameters], Array] | None = None
-    """``noise(u, params)``: covariance added by what is not in the state, such as a gyroscope sample's."""
+    """``noise(u, params)``: covariance of contributions outside the state, such as a gyroscope sample."""
 
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """A measured quantity that drives the transition instead of being compared with it."""
+    """A measured quantity that drives the transition, such as an IMU's rate and specific force."""
 
     name: str
     source: Source
     clock_offset: Callable[[Parameters], Array] | None = None
-    """Seconds to add to a time of the timeline to get the input's own clock, at the start of the run."""
+    """Offset from the timeline to the input's own clock at the start of the run, seconds."""
     clock_drift: Callable[[Parameters], Array] | None = None
-    """Seconds by which that grows in each second of the run."""
+    """Growth of the offset, seconds per second."""
 
     def shift(self, params: Parameters, time: Array) -> Array:
-        """Seconds to add at `time`, seconds since the start of the run."""
+        """Offset from the timeline to the input's clock at `time`, both in seconds; any shape."""
         total = jnp.zeros_like(time)
         if self.clock_offset is not None:
             total = total + self.clock_offset(params)
@@ -184,6 +195,7 @@ class Input:
         return total
 
 
+@renamed_fields(patience_s="gate_reset_after_s")
 @dataclass(frozen=True, eq=False)
 class Model:
     """A system to be estimated. Instances are compared by identity: build each once."""
@@ -207,25 +219,24 @@ class Model:
     """``initial_mean(first)``: the state at the start from the first visible sample of each sensor."""
     initial_covariance: Callable[[Parameters], Array]
     start_with: tuple[str, ...] = ()
-    """Sensors that must have been seen before the run can start."""
+    """Sensors that need a visible sample before the run can start."""
     find_start: FindStart | None = None
-    """``find_start(recording, samples)``: where a run can start, from each sensor's samples while the
-    input lasts; None where it cannot. Without it a run starts when each of `start_with` is seen."""
+    """``find_start(recording, samples)``: the start of a run, or None if it cannot start; `samples` are
+    those during the input. Without it a run starts at the first visible samples of `start_with`."""
     adapt: Callable[[Sequence[Recording]], "Model"] | None = None
-    """The model as these recordings need it, such as with a sensor for each of their markers; the same
-    object for the same need."""
+    """``adapt(recordings)``: the model for these recordings, such as with one sensor per marker; the same
+    object for the same result."""
     setup: Callable[[Recording], Any] | None = None
-    """``setup(recording)``: that part of the parameters which each recording tells itself; None for a
-    model without."""
-    patience_s: float = 0.5
-    """Seconds of refused samples, none let in, after which gates open and the belief is widened."""
+    """``setup(recording)``: `Parameters.setup`; None for a model without."""
+    gate_reset_after_s: float = 0.5
+    """Seconds of rejected samples, none accepted, after which the gates open and the belief is widened."""
     input: Input | None = None
     outputs: tuple[Output, ...] = ()
     project: Callable[[Any], Any] | None = None
-    """Puts an updated mean back on a constraint that its space does not keep; None where it does."""
+    """Projects an updated mean onto a constraint that its space does not keep; None for no constraint."""
     hold_to: str | None = None
-    """Name of the sensor on whose sampling instants every other stream is held (zero-order), as the
-    published discrete-time filter does; None takes every sample at its own time."""
+    """Name of the sensor at whose sampling instants every other stream is held (zero-order hold), as in the
+    published discrete-time filter; None takes every sample at its own time."""
 
     @property
     def error_dim(self) -> int:

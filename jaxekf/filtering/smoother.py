@@ -1,8 +1,8 @@
-"""The smoother: every instant given the whole run, on top of the filter of `jaxekf.filtering.ekf`.
+"""The smoother: the belief at every instant given the whole run.
 
-Rauch, Tung, Striebel on the state space of the model, in the form of `jaxekf.filtering._smoother_pass`:
-one pass back over what the filter left, linearised where the filter was. Compiled, batched and
-differentiated like the filter.
+A Rauch-Tung-Striebel smoother on the state space of the model, in the form of
+`jaxekf.filtering._smoother_pass`: one backward pass over the results of the filter, linearised at the
+filter's estimates. Compiled, batched and differentiated like the filter.
 """
 
 from collections.abc import Sequence
@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxekf.filtering import _smoother_pass as smoother_pass
 from jaxekf.filtering import ekf
-from jaxekf.filtering._lowered_model import System
-from jaxekf.filtering._recursion import First
-from jaxekf.filtering._smoother_pass import Filtered
+from jaxekf.filtering._epoch import ScanInit
+from jaxekf.filtering._lowered_model import LoweredModel
+from jaxekf.filtering._smoother_pass import FilteredBeliefs, smooth_backward
 from jaxekf.filtering.ekf import FilterOutput
-from jaxekf.filtering.lowering import batched_vjp
+from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp
 from jaxekf.filtering.lowering.reverse_only import reverse_only
 from jaxekf.filtering.model import Belief, Model, Parameters
 from jaxekf.filtering.steps import Steps
@@ -28,7 +27,7 @@ class SmootherOutput(NamedTuple):
     """A run filtered and smoothed."""
 
     filtered: FilterOutput
-    """All that the filter left."""
+    """The filter's results, everything kept."""
     smoothed: Belief
     """At the end of each substep, leading axes (K, S)."""
     start: Belief
@@ -40,7 +39,7 @@ def run_smoother(
 ) -> SmootherOutput:
     """Filter and smooth one run from an initial belief; differentiable in everything.
 
-    Samples that the filter's gates refused stay refused. Options and errors as in `run_filter`.
+    Samples that the filter's gates rejected stay rejected. Arguments and errors are those of `run_filter`.
 
     Examples
     --------
@@ -71,25 +70,23 @@ def run_smoother_batch(
 ) -> SmootherOutput:
     """Filter and smooth many runs: every leaf of every argument carries the runs on its first axis.
 
-    Equal to calls of `run_smoother` one by one; options and errors as in `run_filter_batch`.
+    Equal to calls of `run_smoother` one by one; arguments and errors are those of `run_filter_batch`.
     """
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     filtered = ekf.run_filter_batch(
         model, params, belief, steps, keep="everything", adjoint=adjoint, devices=devices
     )
-    ready, prepared, given = ekf.made_ready(model, params, belief, steps)
+    lowered, prepared, inputs = ekf.lower_model(model, params, belief, steps)
     at: Any = filtered.instants
-    trees = (prepared, First(belief), given, Filtered(at.predicted, at.updated, at.refused))
+    beliefs = FilteredBeliefs(at.predicted, at.updated, at.refused)
+    trees = (prepared, ScanInit(belief), inputs, beliefs)
     if adjoint:
-        smoothed, start = _lanes(ready, tuple(devices))(*reverse_only(trees))
+        smoothed, start = _smooth_with_vjp(lowered, tuple(devices))(*reverse_only(trees))
     else:
-        smoothed, start = batched_vjp.on_lanes(
-            partial(smoother_pass.scan_back, ready, False), *trees
-        )
+        smoothed, start = batched(partial(smooth_backward, lowered, False), *trees)
     return SmootherOutput(filtered, smoothed, start)
 
 
 @lru_cache(maxsize=64)
-def _lanes(system: System, devices: tuple[Any, ...]) -> Any:
-    scan = partial(smoother_pass.scan_back, system, True)
-    return batched_vjp.with_own_derivative(devices, scan)
+def _smooth_with_vjp(lowered: LoweredModel, devices: tuple[Any, ...]) -> Any:
+    return batched_with_vjp(devices, partial(smooth_backward, lowered, True))

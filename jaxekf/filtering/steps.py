@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 
 
 class Rows(NamedTuple):
-    """Samples of one sensor, one for each (sub)step; leading axes are the steps'."""
+    """Samples of one sensor, one for each substep or epoch; leading axes (K, S) or (K,)."""
 
     value: Any
-    """What is hidden may be anything, NaN included."""
+    """The sample; hidden numbers may be anything, NaN included."""
     aux: Any
-    """Finite, also where the sample is hidden: it passes through the model's own functions."""
+    """Auxiliary data of `Sensor.predict`; finite also where the sample is hidden."""
     mask: Any
-    """(..., rows) True where a row is visible."""
+    """(..., m) True where a row is visible."""
     dt: Any
     """Sampling period in seconds: the time since the sensor's previous sample, nominal after a gap."""
 
@@ -31,7 +31,7 @@ class Knots(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """What the filter scans over: K epochs of S substeps."""
+    """The inputs of the filter: K epochs of S substeps."""
 
     time: Any
     """(K, S) seconds since the start of the run, at the end of each substep."""

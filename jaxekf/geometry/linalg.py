@@ -2,7 +2,9 @@
 
 Inside a ``lax.scan`` on a CPU a call to LAPACK, or a tiny ``dot``, costs far more than its arithmetic;
 these functions are plain arithmetic which XLA fuses. Matrix indices are the **first** axes; all further
-axes are *lanes*: independent problems, usually runs, next to each other in memory.
+axes are *lanes*: independent problems, usually runs, next to each other in memory. The products are for
+model code, which is written for one run; the filter has those of
+`jaxekf.filtering.lowering.batched_products`.
 """
 
 from collections.abc import Sequence
@@ -151,7 +153,7 @@ def semidefinite_factor(matrix: Array) -> Array:
     index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
     scale = diagonal(lax.stop_gradient(matrix))
     deviation = jnp.sqrt(jnp.maximum(scale, 0.0))
-    # Root of what rounding may leave of each variance. Taking out a small variance makes it larger.
+    # Root of the rounding error of each variance; eliminating a small variance makes it larger.
     slack = jnp.sqrt(8.0 * size * jnp.finfo(matrix.dtype).eps) * deviation
     columns: list[Array] = []
     for j in range(size):
@@ -159,7 +161,7 @@ def semidefinite_factor(matrix: Array) -> Array:
         for column in columns:
             rest = rest - column * column[j][None]
         positive = rest[j] > slack[j] * slack[j]
-        # By Schwarz' inequality little is left of the covariances either.
+        # By Schwarz' inequality the covariances of a zero variance are small, too.
         much = (index > j) & (jnp.abs(rest) > 2.0 * slack[j][None] * deviation)
         empty = (rest[j] >= -slack[j] * slack[j]) & (scale[j] >= 0.0) & ~jnp.any(much, axis=0)
         inverse = lax.rsqrt(jnp.where(positive, rest[j], 1.0))

@@ -1,30 +1,45 @@
-"""A model with other means against samples that do not fit."""
+"""A model with another treatment of outliers: gates, robust weights, or none."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, Literal, get_args
 
+from jaxekf._support.deprecations import renamed_arguments
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering.model import Model, Sensor
 from jaxekf.models import get_model
 from jaxekf.recordings.types import Recording
 
-Means = Literal["gate", "huber", "student", "none"]
-MEANS: tuple[str, ...] = get_args(Means)
+OutlierMethod = Literal["gate", "huber", "student", "none"]
+OUTLIER_METHODS: tuple[str, ...] = get_args(OutlierMethod)
 _GATE = 0.999
 
 
-def robust(model: str | Model, means: Means, probability: float = _GATE) -> Model:
-    """The model with the same means against outliers in all of its sensors.
+@renamed_arguments(means="outlier_method")
+def robust(model: str | Model, outlier_method: OutlierMethod, probability: float = _GATE) -> Model:
+    """The model with one outlier method for all of its sensors.
 
-    ``gate`` refuses a sample outside the chi-square bound that an honest one passes with this
-    `probability`; where gates have refused everything for `Model.patience_s`, the belief is widened and
-    they open once. ``huber`` and ``student`` refuse nothing: a sample counts less the farther it is off, so
-    that none moves the estimate far. ``none`` takes every sample in full.
+    Parameters
+    ----------
+    model
+        The model or its name.
+    outlier_method
+        ``gate`` rejects samples outside a chi-square bound; where gates have rejected everything for
+        `Model.gate_reset_after_s`, the belief is widened and they open once. ``huber`` and ``student``
+        reject nothing but give samples less weight the larger their innovation is, so that none moves the
+        estimate far. ``none`` gives every sample full weight.
+    probability
+        Probability with which a Gaussian sample passes the gate.
 
-    The same object for the same arguments. Raises `ModelError` for other means, or a probability that
-    is not between 0 and 1.
+    Returns
+    -------
+    The same object for the same arguments.
+
+    Raises
+    ------
+    ModelError
+        For an unknown method, or a probability that is not between 0 and 1.
 
     Examples
     --------
@@ -33,22 +48,25 @@ def robust(model: str | Model, means: Means, probability: float = _GATE) -> Mode
     >>> [(sensor.name, sensor.weighting) for sensor in model.sensors]
     [('optical', 'huber')]
     """
-    if means not in MEANS or not 0.0 < probability < 1.0:
+    if outlier_method not in OUTLIER_METHODS or not 0.0 < probability < 1.0:
         raise ModelError(
-            f"got '{means}' with a probability of {probability}, expected one of {', '.join(MEANS)} with"
-            " one between 0 and 1; choose how outliers are met"
+            f"got '{outlier_method}' with a probability of {probability}, expected one of"
+            f" {', '.join(OUTLIER_METHODS)} with one between 0 and 1; choose an outlier method"
         )
-    return _robust(get_model(model), means, probability)
+    return _robust(get_model(model), outlier_method, probability)
 
 
 @lru_cache(maxsize=64)
-def _robust(model: Model, means: Means, probability: float) -> Model:
+def _robust(model: Model, outlier_method: OutlierMethod, probability: float) -> Model:
+    is_weight = outlier_method in ("huber", "student")
     changes: dict[str, Any] = {
-        "gate": probability if means == "gate" else None,
-        "weighting": means if means in ("huber", "student") else None,
+        "gate": probability if outlier_method == "gate" else None,
+        "weighting": outlier_method if is_weight else None,
     }
     sensors = tuple(_changed(sensor, changes) for sensor in model.sensors)
-    adapt = None if model.adapt is None else partial(_adapted, model, means, probability)
+    adapt = model.adapt
+    if adapt is not None:
+        adapt = partial(_adapted, adapt, outlier_method, probability)
     return replace(model, sensors=sensors, adapt=adapt)
 
 
@@ -58,7 +76,6 @@ def _changed(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
 
 
 def _adapted(
-    model: Model, means: Means, probability: float, recordings: Sequence[Recording]
+    adapt: Any, outlier_method: OutlierMethod, probability: float, recordings: Sequence[Recording]
 ) -> Model:
-    assert model.adapt is not None
-    return _robust(model.adapt(recordings), means, probability)
+    return _robust(adapt(recordings), outlier_method, probability)

@@ -1,7 +1,7 @@
-"""Arrays that a loop reads or makes at every step, put together: one slice a step instead of one each.
+"""The arrays of a scan packed into one array per type, so that each step takes one slice.
 
-Every slice is a loop of its own in the compiled step, which costs more than the few numbers it copies, and
-more again to compile.
+Every slice of a scanned array is a loop in the compiled step. With many small arrays these loops cost more
+than the numbers they copy, and time to compile. `jaxekf.filtering._recursion` packs its scans.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from jax import Array
 
 
 class _Layout(NamedTuple):
-    """Where the leaves of a tree lie: array and first number of each, and the shape of one step's."""
+    """Places of the leaves of a tree: packed array and first entry of each, and its shape in one step."""
 
     tree: Any
     places: tuple[tuple[int, int], ...]
@@ -23,16 +23,16 @@ class _Layout(NamedTuple):
 
 @jax.tree_util.register_pytree_node_class
 class Packed:
-    """A tree of arrays as one array for each of their types, (..., numbers).
+    """A tree of arrays packed into one array (..., entries) per type.
 
-    It is a tree itself: a scan slices it, and a `vmap` maps it, along the leading axes.
+    It is a pytree: a scan slices it, and `vmap` maps it, along the leading axes.
     """
 
     def __init__(self, arrays: Sequence[Array], layout: _Layout) -> None:
         self._arrays, self._layout = tuple(arrays), layout
 
-    def opened(self) -> Any:
-        """The tree, its arrays with the leading axes that there are now."""
+    def unpack(self) -> Any:
+        """The tree, its arrays with the present leading axes."""
         tree, places, shapes = self._layout
         leaves = []
         for (which, start), shape in zip(places, shapes, strict=True):
@@ -49,8 +49,8 @@ class Packed:
         return cls(arrays, layout)
 
 
-def packed(tree: Any, axes: int = 0) -> Packed:
-    """The arrays of `tree` together, whose first `axes` axes are the same."""
+def pack(tree: Any, axes: int = 0) -> Packed:
+    """Pack the arrays of `tree`, whose first `axes` axes are equal."""
     leaves, structure = jax.tree.flatten(tree)
     parts: dict[Any, list[Array]] = {}
     places, shapes = [], []

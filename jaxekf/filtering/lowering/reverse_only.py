@@ -1,4 +1,4 @@
-"""An identity that has a reverse derivative only, and says so where a forward one is asked for."""
+"""An identity with a reverse derivative only; a forward derivative through it raises an error."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ def _refuse(*args: Any, **params: Any) -> Any:
 
 
 # Tangents pass through this primitive. In reverse mode it is transposed, to the identity, before it
-# is ever computed; whoever computes it wants a forward derivative.
+# is ever evaluated; evaluating it means that a forward derivative is wanted.
 _tangent_p = Primitive("jaxekf_reverse_only")
 _tangent_p.def_impl(_refuse)
 _tangent_p.def_abstract_eval(lambda aval: aval)

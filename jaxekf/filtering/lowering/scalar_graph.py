@@ -1,8 +1,8 @@
-"""A traced function of one run as a flat list of operations that can be read, cut and evaluated.
+"""A traced function of one run as a flat list of operations: trace, split, evaluate.
 
-The filter needs to know more about a model's functions than how to call them: which numbers of a
-Jacobian are always zero or one, which operations depend on parameters only, and how to do the same work
-for many runs at once. All three are answered from the list of operations.
+The filter needs to know which entries of a Jacobian are always zero or one (`sparsity`), which operations
+depend on the parameters only (`split_by_inputs`), and how to evaluate a function for many runs (`lanes`).
+All three work on the list of operations, a `Program`.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,13 +18,13 @@ _INLINED = _JITTED | {"closed_call", "core_call", "checkpoint", "remat"}
 
 
 class Constant(NamedTuple):
-    """An operand that is not computed."""
+    """An operand that is a constant."""
 
     value: Any
 
 
 class Operation(NamedTuple):
-    """One primitive applied to constants and numbered values."""
+    """One JAX primitive applied to constants and numbered values."""
 
     primitive: Any
     params: dict[str, Any]
@@ -37,15 +37,15 @@ class Operation(NamedTuple):
 
     def bind(self, values: Sequence[Any]) -> list[Any]:
         """The outputs for the given operands."""
-        # Until JAX 0.7 the functions among the parameters came apart from the rest.
-        given = self.primitive.get_bind_params(self.params)
-        functions, params = given if isinstance(given, tuple) else ((), given)
+        # Until JAX 0.7 functions among the parameters were returned separately.
+        bound = self.primitive.get_bind_params(self.params)
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)
         found = self.primitive.bind(*functions, *values, **params)
         return list(found) if self.primitive.multiple_results else [found]
 
 
 class Program(NamedTuple):
-    """Operations in order; values are numbered, inputs first."""
+    """Operations in order of evaluation; values are numbered, inputs first."""
 
     inputs: tuple[Any, ...]
     """Shape and dtype of each input."""
@@ -69,21 +69,21 @@ class Program(NamedTuple):
 
 
 def trace(
-    function: Callable[..., Any], *args: Any, closed_calls: frozenset[str] = frozenset()
+    function: Callable[..., Any], *args: Any, opaque_calls: frozenset[str] = frozenset()
 ) -> Program:
-    """The operations of ``function(*args)``; its inputs are the leaves of `args` in order.
+    """The program of ``function(*args)``; its inputs are the leaves of `args` in order.
 
-    Calls are replaced by what they do, but those of jitted functions named in `closed_calls`.
+    Calls are inlined, except those of jitted functions with a name in `opaque_calls`.
     """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
     tree = jax.tree.structure(shapes)
-    return _program(closed.jaxpr, closed.consts, tree, closed_calls)
+    return _program(closed.jaxpr, closed.consts, tree, opaque_calls)
 
 
-def opened(operation: Operation, closed_calls: frozenset[str] = frozenset()) -> Program:
-    """What a call does, as a program whose outputs are a list."""
+def inlined(operation: Operation, opaque_calls: frozenset[str] = frozenset()) -> Program:
+    """The program of a call; its outputs are a list."""
     tree = jax.tree.structure([0] * len(operation.outputs))
-    return _program(*_called(operation.params), tree, closed_calls)
+    return _program(*_called(operation.params), tree, opaque_calls)
 
 
 def call_name(operation: Operation) -> str | None:
@@ -92,34 +92,34 @@ def call_name(operation: Operation) -> str | None:
 
 
 def _called(params: dict[str, Any]) -> tuple[Any, list[Any]]:
-    """The operations of a call, and their constants."""
+    """The jaxpr of a call, and its constants."""
     found = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
     return getattr(found, "jaxpr", found), list(getattr(found, "consts", ()))
 
 
-def _program(jaxpr: Any, consts: Any, tree: Any, closed_calls: frozenset[str]) -> Program:
+def _program(jaxpr: Any, consts: Any, tree: Any, opaque_calls: frozenset[str]) -> Program:
     operations: list[Operation] = []
     inputs = tuple(_spec(v) for v in jaxpr.invars)
     counter = [len(inputs)]
     constants = [Constant(value) for value in consts]
     numbers = list(range(len(inputs)))
-    outputs = _flatten(jaxpr, constants, numbers, operations, counter, closed_calls)
-    return without_dead(Program(inputs, tuple(operations), tuple(outputs), tree))
+    outputs = _flatten(jaxpr, constants, numbers, operations, counter, opaque_calls)
+    return eliminate_dead_code(Program(inputs, tuple(operations), tuple(outputs), tree))
 
 
-def split(program: Program, first: int) -> tuple[Program, Program]:
-    """Cut off what depends on nothing but the first inputs.
+def split_by_inputs(program: Program, first: int) -> tuple[Program, Program]:
+    """Split off the operations that depend on the first `first` inputs only.
 
-    Returns the program that computes it from the first `first` inputs (its outputs are a list), and
-    the rest, whose inputs are those values followed by the remaining inputs.
+    Returns the program of these operations (its outputs are a list), and the program of the others, whose
+    inputs are those outputs followed by the remaining inputs.
     """
-    early, fixed, made = set(range(first)), set(), {}
+    early, fixed, producers = set(range(first)), set(), {}
     before, after = [], []
     for operation in program.operations:
         operands = [i for i in operation.inputs if not isinstance(i, Constant)]
-        made.update((o, operation) for o in operation.outputs)
+        producers.update((o, operation) for o in operation.outputs)
         if fixed.issuperset(operands):
-            # Needed on both sides perhaps, and made of constants: no value to hand over.
+            # Made of constants only: evaluated on both sides if needed, nothing is handed over.
             fixed.update(operation.outputs)
             before.append(operation)
             after.append(operation)
@@ -128,16 +128,18 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
             before.append(operation)
         else:
             after.append(operation)
-    late = without_dead(program._replace(operations=tuple(after))).operations
+    late = eliminate_dead_code(program._replace(operations=tuple(after))).operations
     specs = dict(enumerate(program.inputs))
     for operation in before:
         specs.update(zip(operation.outputs, operation.shapes, strict=True))
     wanted = _numbers([i for operation in late for i in operation.inputs] + list(program.outputs))
-    needed, moved = _frontier([i for i in dict.fromkeys(wanted) if i in early], early, made, specs)
+    needed, moved = _frontier(
+        [i for i in dict.fromkeys(wanted) if i in early], early, producers, specs
+    )
     places = {o.outputs[0] for o in after} | moved
     after = [o for o in program.operations if o.outputs[0] in places]
     tree = jax.tree.structure([0] * len(needed))
-    head = without_dead(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
+    head = eliminate_dead_code(Program(program.inputs[:first], tuple(before), tuple(needed), tree))
     number = {old: new for new, old in enumerate(needed)}
     rest = range(first, len(program.inputs))
     number |= {old: len(needed) + i for i, old in enumerate(rest)}
@@ -151,20 +153,20 @@ def split(program: Program, first: int) -> tuple[Program, Program]:
         outputs = tuple(number[o] for o in operation.outputs)
         renumbered.append(operation._replace(inputs=operands, outputs=outputs))
     outputs = tuple(o if isinstance(o, Constant) else number[o] for o in program.outputs)
-    return head, without_dead(Program(inputs, tuple(renumbered), outputs, program.tree))
+    return head, eliminate_dead_code(Program(inputs, tuple(renumbered), outputs, program.tree))
 
 
 def _frontier(
-    wanted: Sequence[int], early: set[int], made: dict[int, Operation], specs: dict[int, Any]
+    wanted: Sequence[int], early: set[int], producers: dict[int, Operation], specs: dict[int, Any]
 ) -> tuple[list[int], set[int]]:
-    """What of the early values is handed over for those wanted late, and what is made late all the same.
+    """The early values to hand over for the `wanted` ones, and the operations to move to the late side.
 
-    What only rearranges early values is done late where fewer numbers are handed over for it.
+    Rearrangements of early values are moved if that hands over fewer numbers.
     """
     needed: list[int] = []
     moved: set[int] = set()
     for value in sorted(wanted, key=lambda i: -specs[i].size):
-        sources, between = _sources(value, early, made)
+        sources, between = _sources(value, early, producers)
         fresh = [i for i in sources if i not in needed]
         if sum(specs[i].size for i in fresh) <= specs[value].size:
             needed += fresh
@@ -174,14 +176,16 @@ def _frontier(
     return needed, moved
 
 
-def _sources(value: int, early: set[int], made: dict[int, Operation]) -> tuple[list[int], set[int]]:
-    """What a value is rearranged from, and the values on the way."""
+def _sources(
+    value: int, early: set[int], producers: dict[int, Operation]
+) -> tuple[list[int], set[int]]:
+    """The values that a value is rearranged from, and those in between."""
     sources: list[int] = []
     between: set[int] = set()
     left = [value]
     while left:
         i = left.pop()
-        operation = made.get(i)
+        operation = producers.get(i)
         if operation is not None and operation.primitive.name in _REARRANGED:
             between.add(operation.outputs[0])
             left += [k for k in _numbers(operation.inputs) if k in early and k not in between]
@@ -204,9 +208,9 @@ def _flatten(
     values: list[Any],
     operations: list[Operation],
     counter: list[int],
-    closed_calls: frozenset[str],
+    opaque_calls: frozenset[str],
 ) -> list[Any]:
-    """Append the operations of `jaxpr`, nested calls opened; the operands that are its outputs."""
+    """Append the operations of `jaxpr`, nested calls inlined; returns the operands that are its outputs."""
     number = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *values], strict=True))
 
     def read(atom: Any) -> Any:
@@ -217,24 +221,24 @@ def _flatten(
     for eqn in jaxpr.eqns:
         operands = [read(atom) for atom in eqn.invars]
         name = eqn.primitive.name
-        closed = name in _JITTED and eqn.params.get("name") in closed_calls
+        closed = name in _JITTED and eqn.params.get("name") in opaque_calls
         if name in _INLINED and not closed:
             inner, consts = _called(eqn.params)
             fixed = [Constant(c) for c in consts]
-            found = _flatten(inner, fixed, operands, operations, counter, closed_calls)
+            found = _flatten(inner, fixed, operands, operations, counter, opaque_calls)
         else:
             found = list(range(counter[0], counter[0] + len(eqn.outvars)))
             counter[0] += len(found)
             shapes = tuple(_spec(v) for v in eqn.outvars)
-            given = tuple(_spec(atom) for atom in eqn.invars)
-            ends = (tuple(operands), tuple(found), shapes, given)
-            operations.append(Operation(eqn.primitive, dict(eqn.params), *ends))
+            operand_specs = tuple(_spec(atom) for atom in eqn.invars)
+            fields = (tuple(operands), tuple(found), shapes, operand_specs)
+            operations.append(Operation(eqn.primitive, dict(eqn.params), *fields))
         number.update(zip(eqn.outvars, found, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def without_dead(program: Program) -> Program:
-    """The program without what no output needs."""
+def eliminate_dead_code(program: Program) -> Program:
+    """The program without operations that no output needs."""
     needed = {o for o in program.outputs if not isinstance(o, Constant)}
     kept = []
     for operation in reversed(program.operations):

@@ -1,9 +1,9 @@
-"""Entries of arrays that never change, whatever the state, input and parameters.
+"""Sparsity: entries of arrays that are constant for every state, input and parameter.
 
-A Jacobian is mostly zeros and ones: parts of a state that only walk, sensors that read one part of it.
-The operations of a program are followed entry by entry: zero times anything is zero, and an operation
-that is not listed here makes unknown numbers. So an entry that is called known has that value always;
-nothing is sampled, and nothing needs to be declared.
+A Jacobian is mostly zeros and ones: random walks, sensors that read one part of the state. Constants are
+propagated through the operations of a program entry by entry: zero times anything is zero, and an
+operation without a rule here makes unknown entries. So a known entry always has its value; nothing is
+sampled, and a model declares nothing.
 """
 
 from collections.abc import Callable
@@ -18,36 +18,36 @@ from jaxekf.filtering.lowering.scalar_graph import (
     Constant,
     Operation,
     Program,
-    opened,
-    without_dead,
+    eliminate_dead_code,
+    inlined,
 )
 
 
-class Known(NamedTuple):
-    """An array of which some entries are known: `value` where `known`, zero elsewhere."""
+class KnownEntries(NamedTuple):
+    """An array with some entries known at trace time: `value` where `known`, zero elsewhere."""
 
     value: NDArray[Any]
     known: NDArray[np.bool_]
 
     def is_zero(self) -> NDArray[np.bool_]:
-        """Where the array is zero, whatever it was computed from."""
+        """Which entries are known to be zero."""
         return self.known & (self.value == 0)
 
 
-def find(program: Program) -> Any:
-    """The tree of outputs of `program`, each as `Known`."""
-    values = _followed(program)
+def known_entries(program: Program) -> Any:
+    """The tree of outputs of `program`, each as `KnownEntries`."""
+    values = _propagate(program)
     found = [_read(output, values) for output in program.outputs]
     return jax.tree.unflatten(program.tree, found)
 
 
-def simplified(program: Program) -> Program:
-    """The same program with known arrays as constants, and nothing computed twice."""
-    values = _followed(program)
+def simplify(program: Program) -> Program:
+    """The program with known arrays as constants and without repeated operations."""
+    values = _propagate(program)
     same: dict[Any, Any] = {}
     made: dict[Any, tuple[int, ...]] = {}
 
-    def settled(operand: Any) -> Any:
+    def resolve(operand: Any) -> Any:
         if isinstance(operand, Constant):
             return operand
         known = values.get(operand)
@@ -59,8 +59,8 @@ def simplified(program: Program) -> Program:
     for operation in program.operations:
         if all(values[o].known.all() for o in operation.outputs):
             continue
-        operation = operation._replace(inputs=tuple(map(settled, operation.inputs)))
-        alias = _alias(operation, values)
+        operation = operation._replace(inputs=tuple(map(resolve, operation.inputs)))
+        alias = _unchanged_operand(operation, values)
         key = (operation.primitive, str(operation.params), tuple(map(_identity, operation.inputs)))
         if alias is not None:
             same[operation.outputs[0]] = alias
@@ -69,8 +69,8 @@ def simplified(program: Program) -> Program:
         else:
             made[key] = operation.outputs
             operations.append(operation)
-    outputs = tuple(map(settled, program.outputs))
-    return without_dead(program._replace(operations=tuple(operations), outputs=outputs))
+    outputs = tuple(map(resolve, program.outputs))
+    return eliminate_dead_code(program._replace(operations=tuple(operations), outputs=outputs))
 
 
 def _identity(operand: Any) -> Any:
@@ -80,8 +80,8 @@ def _identity(operand: Any) -> Any:
     return operand
 
 
-def _alias(operation: Operation, values: dict[int, Known]) -> Any:
-    """The operand that an operation leaves as it is; None for an operation that computes."""
+def _unchanged_operand(operation: Operation, values: dict[int, KnownEntries]) -> Any:
+    """The operand that an operation returns unchanged, such as x of ``x + 0``; None for any other."""
     name, inputs = operation.primitive.name, operation.inputs
     neutral = {"add": 0, "add_any": 0, "mul": 1, "sub": 0, "div": 1}.get(name)
     if neutral is None:
@@ -95,88 +95,90 @@ def _alias(operation: Operation, values: dict[int, Known]) -> Any:
     return None
 
 
-def _followed(program: Program) -> dict[int, Known]:
+def _propagate(program: Program) -> dict[int, KnownEntries]:
     values = {i: _unknown(spec) for i, spec in enumerate(program.inputs)}
     for operation in program.operations:
         operands = [_read(i, values) for i in operation.inputs]
-        found = _applied(operation, operands)
+        found = _apply(operation, operands)
         values.update(zip(operation.outputs, found, strict=True))
     return values
 
 
-def _read(operand: Any, values: dict[int, Known]) -> Known:
+def _read(operand: Any, values: dict[int, KnownEntries]) -> KnownEntries:
     if not isinstance(operand, Constant):
         return values[operand]
     if isinstance(operand.value, core.Tracer):
         return _unknown(operand.value)
     value = np.asarray(operand.value)
-    return Known(value, np.ones(value.shape, bool))
+    return KnownEntries(value, np.ones(value.shape, bool))
 
 
-def _unknown(spec: Any) -> Known:
+def _unknown(spec: Any) -> KnownEntries:
     # Keys and other extended types hold no numbers: they are unknown as a whole.
     dtype = spec.dtype if isinstance(spec.dtype, np.dtype) else np.dtype(bool)
-    return Known(np.zeros(spec.shape, dtype), np.zeros(spec.shape, bool))
+    return KnownEntries(np.zeros(spec.shape, dtype), np.zeros(spec.shape, bool))
 
 
-def _applied(operation: Operation, operands: list[Known]) -> list[Known]:
+def _apply(operation: Operation, operands: list[KnownEntries]) -> list[KnownEntries]:
     name, params = operation.primitive.name, operation.params
     if name == "custom_jvp_call":
-        inner = opened(operation)
+        inner = inlined(operation)
         values = dict(enumerate(operands))
         for each in inner.operations:
-            found = _applied(each, [_read(i, values) for i in each.inputs])
+            found = _apply(each, [_read(i, values) for i in each.inputs])
             values.update(zip(each.outputs, found, strict=True))
         return [_read(o, values) for o in inner.outputs]
-    if name in _SPECIAL:
-        found = _SPECIAL[name](params, operands)
-    elif name in _MOVES:
-        found = _moved(_MOVES[name], params, operands)
-    elif name in _ON_VALUES:
-        found = _elementwise(_ON_VALUES[name], operands)
+    if name in _RULES:
+        found = _RULES[name](params, operands)
+    elif name in _REARRANGEMENTS:
+        found = _rearrange(_REARRANGEMENTS[name], params, operands)
+    elif name in _ELEMENTWISE:
+        found = _elementwise(_ELEMENTWISE[name], operands)
     else:
         return [_unknown(spec) for spec in operation.shapes]
     return [
-        Known(np.where(one.known, one.value, 0).astype(spec.dtype), one.known)
+        KnownEntries(np.where(one.known, one.value, 0).astype(spec.dtype), one.known)
         for one, spec in zip(found, operation.shapes, strict=True)
     ]
 
 
-# --- each number alone --------------------------------------------------------------------------------
+# --- elementwise --------------------------------------------------------------------------------------
 
 
-def _elementwise(function: Callable[..., Any], operands: list[Known]) -> list[Known]:
+def _elementwise(function: Callable[..., Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     known = np.broadcast_arrays(*[o.known for o in operands])
     with np.errstate(all="ignore"):
-        return [Known(np.asarray(function(*[o.value for o in operands])), np.all(known, axis=0))]
+        return [
+            KnownEntries(np.asarray(function(*[o.value for o in operands])), np.all(known, axis=0))
+        ]
 
 
-def _product(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _product(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     a, b = operands
     known = (a.known & b.known) | a.is_zero() | b.is_zero()
     with np.errstate(all="ignore"):
-        return [Known(np.where(known, a.value * b.value, 0), known)]
+        return [KnownEntries(np.where(known, a.value * b.value, 0), known)]
 
 
-def _quotient(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _quotient(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     a, b = operands
     zero = a.is_zero()
     known = (a.known & b.known) | zero
     with np.errstate(all="ignore"):
-        return [Known(np.where(zero, 0, np.divide(a.value, b.value)), known)]
+        return [KnownEntries(np.where(zero, 0, np.divide(a.value, b.value)), known)]
 
 
-def _chosen(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _select(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     which, *cases = operands
     index = np.broadcast_to(which.value.astype(int), cases[0].value.shape)[None]
     values, flags = np.stack([c.value for c in cases]), np.stack([c.known for c in cases])
     chosen = np.take_along_axis(values, index, 0)[0]
     known = which.known & np.take_along_axis(flags, index, 0)[0]
     same = flags.all(axis=0) & np.all(values == values[:1], axis=0)
-    return [Known(np.where(known, chosen, values[0]), known | same)]
+    return [KnownEntries(np.where(known, chosen, values[0]), known | same)]
 
 
-_ON_VALUES: dict[str, Callable[..., Any]] = {
+_ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
     "add_any": np.add,
@@ -207,14 +209,14 @@ _ON_VALUES: dict[str, Callable[..., Any]] = {
 # --- rearrangements -----------------------------------------------------------------------------------
 
 
-def _moved(
+def _rearrange(
     move: Callable[[dict[str, Any], list[NDArray[Any]]], Any],
     params: dict[str, Any],
-    operands: list[Known],
-) -> list[Known]:
+    operands: list[KnownEntries],
+) -> list[KnownEntries]:
     values = move(params, [o.value for o in operands])
     flags = move(params, [o.known for o in operands])
-    return [Known(np.asarray(v), np.asarray(f)) for v, f in zip(values, flags, strict=True)]
+    return [KnownEntries(np.asarray(v), np.asarray(f)) for v, f in zip(values, flags, strict=True)]
 
 
 def _broadcast(params: dict[str, Any], arrays: list[NDArray[Any]]) -> Any:
@@ -238,7 +240,7 @@ def _unstack(params: dict[str, Any], arrays: list[NDArray[Any]]) -> Any:
     return list(np.moveaxis(arrays[0], params["axis"], 0))
 
 
-_MOVES: dict[str, Callable[[dict[str, Any], list[NDArray[Any]]], Any]] = {
+_REARRANGEMENTS: dict[str, Callable[[dict[str, Any], list[NDArray[Any]]], Any]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda params, arrays: [np.concatenate(arrays, params["dimension"])],
     "reshape": lambda params, arrays: [arrays[0].reshape(params["new_sizes"])],
@@ -255,16 +257,16 @@ _MOVES: dict[str, Callable[[dict[str, Any], list[NDArray[Any]]], Any]] = {
 # --- sums and products --------------------------------------------------------------------------------
 
 
-def _reduced(function: Callable[..., Any]) -> Callable[..., list[Known]]:
-    def rule(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _reduced(function: Callable[..., Any]) -> Callable[..., list[KnownEntries]]:
+    def rule(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
         axes = tuple(params["axes"])
         known = np.asarray(operands[0].known.all(axis=axes))
-        return [Known(np.asarray(function(operands[0].value, axis=axes)), known)]
+        return [KnownEntries(np.asarray(function(operands[0].value, axis=axes)), known)]
 
     return rule
 
 
-def _dot_general(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _dot_general(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     """An entry is known where every product in its sum is: of known factors, or with a zero."""
     (left_sum, right_sum), (left_batch, right_batch) = params["dimension_numbers"]
     left, right = operands
@@ -283,10 +285,10 @@ def _dot_general(params: dict[str, Any], operands: list[Known]) -> list[Known]:
         return np.einsum(path, a.astype(int), b.astype(int))
 
     unknown = count(~left.known, ~right.is_zero()) + count(~left.is_zero(), ~right.known)
-    return [Known(np.einsum(path, left.value, right.value), np.asarray(unknown == 0))]
+    return [KnownEntries(np.einsum(path, left.value, right.value), np.asarray(unknown == 0))]
 
 
-def _padded(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _padded(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     array, filling = operands
     found = []
     for values, fill in ((array.value, filling.value), (array.known, filling.known)):
@@ -298,17 +300,17 @@ def _padded(params: dict[str, Any], operands: list[Known]) -> list[Known]:
         whole = np.full(shape, fill)
         whole[np.ix_(*[p[i] for i, p in here])] = values[np.ix_(*[i for i, _ in here])]
         found.append(whole)
-    return [Known(*found)]
+    return [KnownEntries(*found)]
 
 
-def _iota(params: dict[str, Any], operands: list[Known]) -> list[Known]:
+def _iota(params: dict[str, Any], operands: list[KnownEntries]) -> list[KnownEntries]:
     shape, axis = params["shape"], params["dimension"]
     line = np.arange(shape[axis]).reshape([-1 if a == axis else 1 for a in range(len(shape))])
     value = np.broadcast_to(line, shape)
-    return [Known(value, np.ones(shape, bool))]
+    return [KnownEntries(value, np.ones(shape, bool))]
 
 
-_SPECIAL: dict[str, Callable[[dict[str, Any], list[Known]], list[Known]]] = {
+_RULES: dict[str, Callable[[dict[str, Any], list[KnownEntries]], list[KnownEntries]]] = {
     "div": _quotient,
     "dot_general": _dot_general,
     "integer_pow": lambda params, operands: _elementwise(
@@ -322,5 +324,5 @@ _SPECIAL: dict[str, Callable[[dict[str, Any], list[Known]], list[Known]]] = {
     "reduce_min": _reduced(np.min),
     "reduce_or": _reduced(np.any),
     "reduce_sum": _reduced(np.sum),
-    "select_n": _chosen,
+    "select_n": _select,
 }

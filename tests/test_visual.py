@@ -273,7 +273,7 @@ def test_a_start_is_sought_where_a_pose_follows():
     np.testing.assert_allclose(start.first["position"], whole.position[40], atol=1e-8)
     near = slice(40, 45)
     t = (camera.time_ns[near] - camera.time_ns[40]) / 1e9
-    weight = 1.0 / correspondences._doubt(whole)[near]
+    weight = 1.0 / correspondences._uncertainty(whole)[near]
     slope = np.polyfit(t, whole.position[near], 1, w=weight)[0]
     np.testing.assert_allclose(start.first["velocity"], slope, atol=1e-6)
 
@@ -313,7 +313,7 @@ def test_a_start_does_not_wait_for_the_best_image():
     run = camera_recording("run", seed=0, duration_s=6.0, grade=few(pixel=6.0))
     camera = run.camera
     found = pnp.poses(camera)
-    doubt = np.where(found.valid, correspondences._doubt(found), np.inf)
+    doubt = np.where(found.valid, correspondences._uncertainty(found), np.inf)
     assert np.argmin(doubt) > 50
     start = correspondences.find_start(run, {"camera": correspondences.camera(8, False, run)})
     first = int(np.flatnonzero(camera.time_ns == start.time_ns)[0])
@@ -396,9 +396,9 @@ def test_poses_are_kept_with_their_camera():
     camera = camera_recording("run", seed=2, duration_s=1.0, grade=few()).camera
     found = pnp.poses(camera)
     assert pnp.poses(camera) is found and pnp.cached_poses(camera) is found
-    kept = len(pnp._KEPT)
+    kept = len(pnp._CACHE)
     del camera
-    assert len(pnp._KEPT) == kept - 1
+    assert len(pnp._CACHE) == kept - 1
 
 
 def test_tables_count_a_camera_as_the_tracker():

@@ -182,9 +182,7 @@ def test_a_full_disk(tmp_path, monkeypatch, error):
     monkeypatch.setattr(run_folder, "write_sheet", breaks)
     done = call("simulate", "--duration", 1, "--rest", 0.2, "-o", tmp_path)
     assert done.exit_code == 1
-    expected = (
-        f"Error: {tmp_path / 'free-0'}: got 'No space left on device', expected free space"
-    )
+    expected = f"Error: {tmp_path / 'free-0'}: got 'No space left on device', expected free space"
     assert done.output.startswith(expected)
     assert len(done.output.splitlines()) == 1
     assert not list(tmp_path.iterdir())

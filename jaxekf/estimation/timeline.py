@@ -140,9 +140,7 @@ def build(
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
     if start_sample is None:
-        start_sample = Start(
-            start, {name: first_visible(stream) for name, stream in samples.items()}
-        )
+        start_sample = Start(start, {name: first_visible(s) for name, s in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}
     setup = model.parameters.setup if model.setup is None else model.setup(recording)
     return Timeline(

@@ -233,9 +233,9 @@ def mean(errors: Sequence[OrientationError]) -> OrientationError:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL")
-    parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL")
-    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL", help="training trials")
+    parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL", help="test trials")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="iterations (12)")
     parser.add_argument("--alone", action="store_true", help="no comparison with other filters")
     arguments = parse(parser, "broad")
     if arguments.smoke:

@@ -51,9 +51,9 @@ def load(folder: Path, trials: list[str], seed: int) -> list[jaxekf.Recording]:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL")
-    parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--train", nargs="+", default=[], metavar="TRIAL", help="training trials")
+    parser.add_argument("--test", nargs="+", default=[], metavar="TRIAL", help="test trials")
+    parser.add_argument("--seed", type=int, default=0, help="random seed of the tracker (0)")
     parser.add_argument("--iterations", type=int, default=20)
     parser.add_argument(
         "--baselines", nargs="*", choices=tuning.BASELINES, help="hold out, with these"

@@ -102,8 +102,8 @@ def summarise(name: str, records: list[jaxekf.Recording]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--smoke", action="store_true", help="one seed, `loose` alone")
+    parser.add_argument("--seeds", type=int, default=20, help="number of seeds (20)")
+    parser.add_argument("--smoke", action="store_true", help="one seed, only `loose`")
     parser.add_argument(
         "-o", "--output", type=Path, help="folder for the figures of the first seed"
     )

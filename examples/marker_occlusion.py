@@ -365,7 +365,7 @@ def checks_of(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=1000, help="number of seeds (1000)")
     parser.add_argument("--quick", action="store_true", help="40 seeds, nothing is checked")
     parser.add_argument("--smoke", action="store_true", help="two seeds, grade (a) only")
     parser.add_argument("-o", "--output", type=Path, help="folder for the figure")

@@ -275,7 +275,7 @@ def main() -> None:
     parser.add_argument(
         "--minutes", type=float, default=30.0, help="duration, min, at least 0.5 (30)"
     )
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     parser.add_argument("--output", type=Path, help="PNG file for the figure")
     parser.add_argument("--smoke", action="store_true", help="half a minute, nothing is checked")
     arguments = parser.parse_args()

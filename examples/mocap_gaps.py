@@ -281,7 +281,14 @@ def checks_of(table: dict[str, Any], outlying: dict[str, Any]) -> dict[str, bool
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rooms", nargs="+", metavar="N", help="numbers of TUM-VI rooms")
-    parser.add_argument("--hide", nargs="+", type=float, default=[0.5, 1.0, 2.0], metavar="SECONDS")
+    parser.add_argument(
+        "--hide",
+        nargs="+",
+        type=float,
+        default=[0.5, 1.0, 2.0],
+        metavar="SECONDS",
+        help="lengths of the hidden intervals, s (0.5 1 2)",
+    )
     arguments = parse(parser, "tumvi")
     if arguments.smoke:
         arguments.rooms, arguments.hide = ["4"], [0.5]

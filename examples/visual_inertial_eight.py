@@ -200,8 +200,8 @@ def figure(run: jaxekf.Recording, one: Any) -> Any:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--figure", type=Path, default=Path("eight.png"))
+    parser.add_argument("--seeds", type=int, default=20, help="number of seeds (20)")
+    parser.add_argument("--figure", type=Path, default=Path("eight.png"), help="figure (eight.png)")
     parser.add_argument("--smoke", action="store_true", help="one run at one rate")
     return parser.parse_args()
 

@@ -109,16 +109,7 @@ def build(
         name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
         for name, stream in counted.items()
     }
-    samples = {name: cut(stream, start, end) for name, stream in samples.items()}
-    for name, stream in samples.items():
-        if len(stream.time_ns) == 0:
-            raise RecordingError(
-                recording.path or recording.name,
-                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, the"
-                f" interval that model '{model.name}' estimates",
-                "at least one",
-                "streams that overlap, or a model without that sensor",
-            )
+    samples = _cut_to_run(model, recording, samples, start, end)
     if model.hold_to is not None:
         samples = hold(samples, model.hold_to, account)
     events = [stream.time_ns for stream in samples.values()]
@@ -149,9 +140,7 @@ def build(
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
     if start_sample is None:
-        start_sample = Start(
-            start, {name: first_visible(stream) for name, stream in samples.items()}
-        )
+        start_sample = Start(start, {name: first_visible(s) for name, s in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}
     setup = model.parameters.setup if model.setup is None else model.setup(recording)
     return Timeline(
@@ -166,6 +155,23 @@ def build(
         requested,
         measured,
     )
+
+
+def _cut_to_run(
+    model: Model, recording: Recording, samples: dict[str, Samples], start: int, end: int
+) -> dict[str, Samples]:
+    """The samples from start to end of the run, at least one of each sensor."""
+    samples = {name: cut(stream, start, end) for name, stream in samples.items()}
+    for name, stream in samples.items():
+        if len(stream.time_ns) == 0:
+            raise RecordingError(
+                recording.path or recording.name,
+                f"no sample of {name} from {start / NANOSECONDS:.6f} to {end / NANOSECONDS:.6f} s, the"
+                f" interval that model '{model.name}' estimates",
+                "at least one",
+                "streams that overlap, or a model without that sensor",
+            )
+    return samples
 
 
 def build_many(

@@ -21,7 +21,7 @@ _NOISE = re.compile(r"cpu_aot_loader|xla_bridge")
 
 
 def run_block(kind: str, code: str, folder: str) -> str:
-    """What a block prints, standard output first; raises `SystemExit` where it fails."""
+    """Output of a block, standard output first; raises `SystemExit` where it fails."""
     shell = f'jaxekf() {{ "{sys.executable}" -m jaxekf "$@"; }}\nset -e\n{code}'
     command = ["bash", "-c", shell] if kind == "sh" else [sys.executable, "-c", code]
     path = os.pathsep.join([str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])

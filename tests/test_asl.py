@@ -690,5 +690,5 @@ def test_gravity_is_as_assumed(tmp_path, up):
     if up[2] > 9.0:
         assert asl.load(root).info["gravity_ref"] == [0.0, 0.0, -9.81]
         return
-    with pytest.raises(RecordingError, match=r"free fall of .* z points up"):
+    with pytest.raises(RecordingError, match=r"gravity vector of .* z points up"):
         asl.load(root)

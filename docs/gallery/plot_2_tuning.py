@@ -27,7 +27,7 @@ tuned = tuning.tune(training, objective="likelihood", confidence_intervals=True,
 for label, (value, low, high) in tuned.intervals.items():
     print(f"{label:18} {value:.3g}, 95 % interval {low:.3g} to {high:.3g}")
 for label, recordings in tuned.open.items():
-    print(f"{label:18} stays at its start: {recordings} would tell it")
+    print(f"{label:18} keeps its initial value: {recordings} would determine it")
 
 # %%
 # On the run that was not used, the error falls, and NIS and NEES come to 1: the covariance now

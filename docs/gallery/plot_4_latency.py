@@ -3,7 +3,7 @@ A planted latency, found and corrected
 ======================================
 
 The tracker's samples are stamped 20 ms later than they were taken, as happens where the time is
-that of the arrival at the computer. Nothing in the recording says so.
+that of the arrival at the computer. Nothing in the recording shows it.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ for verdict in diagnosis.verdicts:
     print(verdict)
 
 # %%
-# The innovations alone say so: where the tracker is late they follow the angular rate. The size is
+# The innovations alone show it: where the tracker is late they follow the angular rate. The size is
 # given with its uncertainty, as a number that a program can use:
 
 fault = next(f for f in diagnosis.sensors["optical"].faults if f.kind == "latency")

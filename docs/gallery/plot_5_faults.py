@@ -5,7 +5,7 @@ Faults, and how they look
 One simulated run of 48 s, and the same with one fault at a time. Each picture shows the normalised
 innovation squared (NIS) of the tracker by degree of freedom, with the band that holds 95 % of the
 samples of a consistent filter, and the autocorrelation of the whitened innovations with its 95 %
-bounds. Below it is what `jaxekf.diagnose` says; its second argument, the recording with an encoder,
+bounds. Below it is the verdict of `jaxekf.diagnose`; its second argument, the recording with an encoder,
 is left out on purpose, since innovations need no truth.
 """
 
@@ -122,7 +122,7 @@ scaled = show(RUN.replace(imu=replace(IMU, gyroscope=1.03 * IMU.gyroscope)))
 # The gyroscope is turned in the body
 # -----------------------------------
 #
-# By 2 deg about x, while the recording says that it is not.
+# By 2 deg about x, while the recording states that it is not.
 
 TURN = Rotation.from_rotvec(np.deg2rad([2.0, 0.0, 0.0]))
 turned = show(RUN.replace(imu=replace(IMU, gyroscope=TURN.apply(IMU.gyroscope))))

@@ -219,7 +219,7 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
             f" {found.rate_correlation:.2f})"
         )
     elif found.turns:
-        lines.append("rate: too little turning, or too unlike, to tell the gyroscope's unit")
+        lines.append("rate: too little turning, or too unlike, to determine the gyroscope's unit")
     if found.readings and tracker == "tracker":
         others = max(made.explained for made in found.readings.values())
         lines.append(

@@ -118,7 +118,7 @@ def _check_gravity(recording: Recording, stream: Stream) -> None:
     if np.linalg.norm(found - _GRAVITY_REF) > _FARTHEST_GRAVITY:
         raise RecordingError(
             stream.file,
-            f"free fall of {np.round(found, 2).tolist()} m/s^2 by accelerometer and poses together",
+            f"a gravity vector of {np.round(found, 2).tolist()} m/s^2 by accelerometer and poses together",
             f"about {list(_GRAVITY_REF)}",
             "checking that the reference's z points up, the units (m/s^2, m, ns), the order of the"
             " quaternion, T_BS and that both streams have one clock",

@@ -44,7 +44,7 @@ class ComparedResult(NamedTuple):
 def compare(result: SavedResult) -> ComparedResult:
     """Read the recording that a result names, and compare the two.
 
-    `missing` says why a recording cannot be used: it is gone, broken, or another one than was estimated.
+    `missing` is the reason for which a recording cannot be used: it is gone, broken, or another one than was estimated.
     The score is the saved one; it is computed for results of earlier versions, which have none.
     """
     recording, missing = _load(result)
@@ -79,7 +79,7 @@ def _load(result: SavedResult) -> tuple[Recording | None, str]:
     """The recording, or why there is none."""
     named = result.document.provenance.get("recording")
     if not isinstance(named, str) or not named:
-        return None, "the result does not say where its recording is"
+        return None, "the result has no path of its recording"
     try:
         recording = run_folder.load(Path(named))
     except (RecordingError, OSError) as error:

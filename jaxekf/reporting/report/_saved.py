@@ -133,7 +133,7 @@ def _existing(file: Path) -> Path:
 
 
 def _read_document(folder: Path) -> ResultDocument:
-    """Read `result.json`, or say why the folder is not a result."""
+    """Read `result.json`. Raises `RecordingError` if the folder is not a result."""
     file = folder / "result.json"
     if not folder.is_dir():
         raise RecordingError(folder, "no such folder", _EXPECTED, "another path")

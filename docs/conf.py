@@ -13,6 +13,7 @@ os.environ.setdefault("JAXEKF_COMPILE", "quick")
 # XLA logs lines of three kilobytes for programs read from a cache.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+import _api  # noqa: E402
 import _streams  # noqa: E402
 from sphinx.application import Sphinx  # noqa: E402
 from sphinx.ext.napoleon.docstring import NumpyDocstring  # noqa: E402
@@ -21,6 +22,7 @@ import jaxekf  # noqa: E402
 
 jaxekf.set_up()
 _streams.write(HERE / "_generated" / "streams.md")
+_api.write(HERE / "api" / "modules")
 
 project = "jaxekf"
 author = "The jaxekf authors"

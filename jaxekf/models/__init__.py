@@ -2,42 +2,19 @@
 
 Choose `loose` for a tracker that reports attitudes, `loose_pose` for one that reports poses, `tight` for
 single markers, `visual` for landmarks in images, and `marg` without a tracker; each module begins with its
-states, sensors, parameters and source. A new model is a file here and a line below.
+states, sensors, parameters and source. A new model is a file here: every `Model` of a
+public module is found.
 """
 
 import importlib
 import os
 import sys
 from collections.abc import Sequence
+from pkgutil import iter_modules
 
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering.model import Model
-from jaxekf.models import (
-    loose,
-    loose_additive,
-    loose_pose,
-    loose_rate,
-    marg,
-    tight,
-    triad,
-    visual,
-)
 from jaxekf.recordings.types import Recording
-
-REGISTRY: dict[str, Model] = {
-    model.name: model
-    for model in (
-        loose.MODEL,
-        loose_rate.MODEL,
-        loose_additive.MODEL,
-        loose_pose.MODEL,
-        tight.MODEL,
-        triad.MODEL,
-        marg.MODEL,
-        visual.MODEL,
-        visual.BILINEAR,
-    )
-}
 
 
 def adapted(model: Model, recordings: Sequence[Recording]) -> Model:
@@ -91,3 +68,14 @@ def get_model(model: str | Model) -> Model:
             " name the attribute that holds the model"
         )
     return found
+
+
+def _all_models() -> dict[str, Model]:
+    names = (module.name for module in iter_modules(__path__) if not module.name.startswith("_"))
+    modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
+    found = [one for module in modules for one in vars(module).values() if isinstance(one, Model)]
+    return {model.name: model for model in sorted(found, key=lambda model: model.name)}
+
+
+REGISTRY = _all_models()
+"""Models by name."""

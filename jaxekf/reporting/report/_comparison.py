@@ -44,8 +44,9 @@ class ComparedResult(NamedTuple):
 def compare(result: SavedResult) -> ComparedResult:
     """Read the recording that a result names, and compare the two.
 
-    `missing` is the reason for which a recording cannot be used: it is gone, broken, or another one than was estimated.
-    The score is the saved one; it is computed for results of earlier versions, which have none.
+    `missing` is the reason for which a recording cannot be used: it is gone, broken, or another one
+    than was estimated. The score is the saved one; it is computed for results of earlier versions,
+    which have none.
     """
     recording, missing = _load(result)
     sight = None

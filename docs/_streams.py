@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from jaxekf.io._stream_options import COMMON, UNITS
+from jaxekf.io._section_entries import COMMON
 from jaxekf.io.schema import StreamSchema
 from jaxekf.io.streams import SCHEMAS
+from jaxekf.io.units import UNITS
 from jaxekf.recordings.types import STREAMS
 
 

@@ -46,7 +46,7 @@ _ROOMS = {
         "container_guard>_container_integrity container_layout>_container_schema "
         "container_streams>streams containers>container datasets>importers "
         "description encoder_storage>streams.encoder export files>atomic frame_lines>_frame_rows "
-        "hashes marker_storage>streams.markers stated>_stream_options storage>run_folder "
+        "hashes marker_storage>streams.markers stated>_section_entries storage>run_folder "
         "tables>csv_table temporary>_temporary text>_csv_text"
     ),
     "jaxekf.io.importers": (

@@ -16,7 +16,7 @@ import tomli_w
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks import plausibility
-from jaxekf.io import _stream_options as stream_options
+from jaxekf.io import _section_entries as section_entries
 from jaxekf.io import container, description
 from jaxekf.io.atomic import whole_folder
 from jaxekf.io.csv_table import Table, read_table, write_sheet
@@ -63,7 +63,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
 def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / facts.FILE
-    stream_options.check_keys(about, "", place, run_keys())
+    section_entries.check_keys(about, "", place, run_keys())
     if not isinstance(about.get("trust_units", False), bool):
         raise RecordingError(
             place,
@@ -79,8 +79,8 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     for label, schema in SCHEMAS.items():
         section = about.get(label, {})
         description.check_section(place, label, section, schema.described)
-        stream_options.check_keys(section, label, place, section_keys())
-        how = stream_options.layout(label, section, place)
+        section_entries.check_keys(section, label, place, section_keys())
+        how = section_entries.layout(label, section, place)
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
             table = read_table(file, how)
@@ -198,7 +198,7 @@ def save(
     about |= {
         k: v for k, v in recording.info.items() if not k.endswith("_about") and k not in about
     }
-    stream_options.check_keys(about, "", facts.FILE, run_keys())
+    section_entries.check_keys(about, "", facts.FILE, run_keys())
     about |= facts.known_entries(about, facts.FILE)
     with whole_folder(path, facts.FILE, overwrite=overwrite) as folder:
         for label, stream in recording.streams.items():

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _stream_options as stream_options
+from jaxekf.io import _section_entries as section_entries
+from jaxekf.io import units
 from jaxekf.io.csv_table import (
     Sheet,
     Table,
@@ -148,7 +149,7 @@ class StreamSchema:
             object.__setattr__(self, "layouts", (_layout(self.fields),))
         held = {key for key, one in self.options.items() if one.held}
         held |= {one.option for one in self.fields.values() if one.option}
-        object.__setattr__(self, "held", frozenset({*held, *stream_options.OF_THE_FILE}))
+        object.__setattr__(self, "held", frozenset({*held, *section_entries.OF_THE_FILE}))
 
     @property
     def stored(self) -> dict[str, Field]:
@@ -202,11 +203,11 @@ class StreamSchema:
         scale = dict(
             zip(
                 self.units,
-                stream_options.factors(self.name, self.units, section, place),
+                units.factors(self.name, self.units, section, place),
                 strict=True,
             )
         )
-        turning = stream_options.turning(self.name, section, place)
+        turning = section_entries.turning(self.name, section, place)
         found: dict[str, Any] = {"time_ns": stamps(table)}
         for name, option in self.options.items():
             if option.parse is not None:
@@ -236,7 +237,7 @@ class StreamSchema:
             value, at = np.ascontiguousarray(every[:, at : at + len(names)]), at + len(names)
             one = self.fields[name]
             value = turning.standard(value) if one.frame == facts.BODY_TO_REFERENCE else value
-            found[name] = stream_options.scaled(value, scale.get(one.unit, 1.0))
+            found[name] = units.scaled(value, scale.get(one.unit, 1.0))
         return found
 
     def _plain(

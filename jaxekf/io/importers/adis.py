@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf._support.errors import RecordingError
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Place
 from jaxekf.recordings.types import NANOSECONDS, Recording
-
-_G = 9.80665
 
 
 def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
@@ -52,12 +51,12 @@ def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
             "another file",
         )
     time_ns = np.round(np.arange(len(data)) * (NANOSECONDS / sampling_hz)).astype(np.int64)
-    imu, account = screening.imu(Place(file), time_ns, np.deg2rad(data[:, :3]), _G * data[:, 3:])
-    info = {
+    imu, account = screening.imu(Place(file), time_ns, np.deg2rad(data[:, :3]), STANDARD_GRAVITY *
+    data[:, 3:]) info = {
         "sampling_rate_hz": sampling_hz,
         "assumptions": [
             "Columns are the gyroscope about x, y, z in deg/s and the accelerometer along x, y, z in g"
-            f" ({_G} m/s^2), in the IMU's frame.",
+            f" ({STANDARD_GRAVITY} m/s^2), in the IMU's frame.",
             f"Samples are evenly spaced at {sampling_hz:g} Hz: the file has no times.",
         ],
     }

@@ -8,7 +8,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io._stream_options import COMMON
+from jaxekf.io._section_entries import COMMON
 from jaxekf.io.schema import StreamSchema, check_complete
 from jaxekf.recordings.types import STREAMS
 

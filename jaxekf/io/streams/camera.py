@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _stream_options as stream_options
-from jaxekf.io import description
+from jaxekf.io import description, units
 from jaxekf.io._frame_rows import (
     NAMES,
     bad_name,
@@ -53,7 +52,7 @@ def _read(table: Table, source: description.Source, landmarks: Table) -> tuple[C
     is not a finite number, and for a missing focal length or centre.
     """
     about, place = source.about, source.place
-    length, _ = stream_options.factors("camera", ("m", "px"), about, place)
+    length, _ = units.factors("camera", ("m", "px"), about, place)
     optics = _optics(about, place, "camera.")
     names, p_ref_landmark = _places(landmarks, length)
     pixel, sigma = numbers(table, ("u", "v"), blank=True), reported(table, "sigma")
@@ -244,7 +243,7 @@ def _places(table: Table, length: float) -> tuple[tuple[str, ...], Floats]:
             NAMES,
             "renaming the landmark, or removing the line",
         )
-    return names, stream_options.scaled(finite_numbers(table, POSITION), length)
+    return names, units.scaled(finite_numbers(table, POSITION), length)
 
 
 def _landmark_of_each_line(table: Table, names: tuple[str, ...], places: Table) -> Indices:

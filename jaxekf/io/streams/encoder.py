@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _stream_options as stream_options
-from jaxekf.io import description
+from jaxekf.io import _section_entries as section_entries
+from jaxekf.io import description, units
 from jaxekf.io.csv_table import (
     POSITION,
     QUATERNION,
@@ -39,15 +39,15 @@ def _read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     scored, position = flags(table, "scored"), None
     frame = _fixed_rotation(about, "q_optical_encoder", place)
     if "angle" in table.columns:
-        (scale,) = stream_options.factors("encoder", ("rad",), about, place)
+        (scale,) = units.factors("encoder", ("rad",), about, place)
         length = 1.0
         angle = scale * numbers(table, ("angle",), blank=True)[:, 0]
         known = np.isfinite(angle)
         q = joint_attitude(np.where(known, angle, 0.0), about, place)
         q[~known] = np.nan
     else:
-        _, length = stream_options.factors("encoder", ("1", "m"), about, place)
-        turning = stream_options.turning("encoder", about, place)
+        _, length = units.factors("encoder", ("1", "m"), about, place)
+        turning = section_entries.turning("encoder", about, place)
         q = turning.standard(numbers(table, turning.columns(table.columns), blank=True))
     if set(POSITION) <= set(table.columns):
         origin = about.get("p_optical_encoder", [0.0, 0.0, 0.0])

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io import _stream_options as stream_options
-from jaxekf.io import description
+from jaxekf.io import description, units
 from jaxekf.io._frame_rows import (
     NAMES,
     bad_name,
@@ -38,7 +37,7 @@ def _read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     decrease, and for what is not a finite number.
     """
     about, place = source.about, source.place
-    (length,) = stream_options.factors("markers", ("m",), about, place)
+    (length,) = units.factors("markers", ("m",), about, place)
     names, p_body_marker = _geometry(about.get("geometry"), place)
     position = length * numbers(table, POSITION, blank=True)
     error = reported(table, "error", least=0.0)

@@ -28,16 +28,6 @@ COMMON = {
 """Entries of every stream's section, and what they mean."""
 OF_THE_FILE = ("file", "columns", "skip_lines", "delimiter", "time_unit")
 """Entries that are of no more use once a file is read."""
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0},
-    "m/s^2": {"m/s^2": 1.0, "g": 9.80665, "mm/s^2": 1e-3},
-    "rad": {"rad": 1.0, "deg": np.pi / 180.0},
-    "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "N m": {"N m": 1.0, "N mm": 1e-3},
-    "Pa": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "bar": 1e5},
-}
-"""Units that a file may have, and their size in the SI unit; any other SI unit is only itself."""
 _DIRECTIONS = ("body to reference", "reference to body")
 
 
@@ -87,28 +77,28 @@ def layout(label: str, about: Mapping[str, Any], place: Path | str) -> Layout:
     def stated(key: str, kind: type, expected: str, default: Any) -> Any:
         value = about.get(key, default)
         if value is not default and (not isinstance(value, kind) or isinstance(value, bool)):
-            raise _wrong(place, label, key, value, expected)
+            raise wrong_entry(place, label, key, value, expected)
         return value
 
     file = stated("file", str, "the name of a file in the run's folder", None)
     if file is not None and (not file or Path(file).name != file):
-        raise _wrong(place, label, "file", file, "the name of a file in the run's folder")
+        raise wrong_entry(place, label, "file", file, "the name of a file in the run's folder")
     skip = stated("skip_lines", int, "a number of lines, 0 or more", 0)
     if skip < 0:
-        raise _wrong(place, label, "skip_lines", skip, "a number of lines, 0 or more")
+        raise wrong_entry(place, label, "skip_lines", skip, "a number of lines, 0 or more")
     delimiter = stated("delimiter", str, "one of , ; and tab", None)
     if delimiter is not None and delimiter not in DELIMITERS:
-        raise _wrong(place, label, "delimiter", delimiter, "one of , ; and tab")
+        raise wrong_entry(place, label, "delimiter", delimiter, "one of , ; and tab")
     unit = stated("time_unit", str, f"one of {', '.join(TIME_UNITS)}", "s")
     if unit not in TIME_UNITS:
-        raise _wrong(place, label, "time_unit", unit, f"one of {', '.join(TIME_UNITS)}")
+        raise wrong_entry(place, label, "time_unit", unit, f"one of {', '.join(TIME_UNITS)}")
     columns = about.get("columns")
     if isinstance(columns, list) and columns and all(isinstance(name, str) for name in columns):
         header = tuple(name.strip() for name in columns)
         return Layout(file, None, header, skip, delimiter, unit)
     if columns is not None and not _is_renaming(columns):
         expected = "our names and the file's, { time = 'theirs' }, or a list of our names"
-        raise _wrong(place, label, "columns", columns, expected)
+        raise wrong_entry(place, label, "columns", columns, expected)
     return Layout(file, dict(columns) if columns else None, None, skip, delimiter, unit)
 
 
@@ -120,28 +110,6 @@ def _is_renaming(columns: Any) -> bool:
     )
 
 
-def factors(
-    label: str, units: Sequence[str], about: Mapping[str, Any], place: Path | str
-) -> tuple[float, ...]:
-    """Size of each stated unit, ``unit = "deg/s, g"``, in the SI `units` of a stream; 1 where none is
-    stated."""
-    known = [UNITS.get(unit, {unit: 1.0}) for unit in units]
-    value = about.get("unit")
-    parts = [part.strip() for part in value.split(",")] if isinstance(value, str) else []
-    good = all(part in choices for part, choices in zip(parts, known, strict=False))
-    # Further units, such as a magnetometer's, are not used.
-    if value is not None and (not parts or not good):
-        expected = ", then ".join(" or ".join(choices) for choices in known)
-        raise _wrong(place, label, "unit", value, expected)
-    stated = [choices[part] for part, choices in zip(parts, known, strict=False)]
-    return (*stated, *[1.0] * (len(known) - len(stated)))
-
-
-def scaled(values: Floats, factor: float) -> Floats:
-    """Numbers in SI; the same array, no copy, where they are."""
-    return values if factor == 1.0 else factor * values
-
-
 def turning(label: str, about: Mapping[str, Any], place: Path | str) -> Turning:
     """Order and direction of a stream's quaternions, ``quaternion = "w,x,y,z, body to reference"``."""
     value = about.get("quaternion", BODY_TO_REFERENCE)
@@ -151,10 +119,12 @@ def turning(label: str, about: Mapping[str, Any], place: Path | str) -> Turning:
     order, direction = tuple(parts[:4]), parts[4:] or [_DIRECTIONS[0]]
     if sorted(order) != ["w", "x", "y", "z"] or direction not in ([d] for d in _DIRECTIONS):
         expected = f"'{BODY_TO_REFERENCE}', or another order, or 'reference to body'"
-        raise _wrong(place, label, "quaternion", value, expected)
+        raise wrong_entry(place, label, "quaternion", value, expected)
     return Turning(order, direction == [_DIRECTIONS[1]])
 
 
-def _wrong(place: Path | str, label: str, key: str, value: Any, expected: str) -> RecordingError:
+def wrong_entry(
+    place: Path | str, label: str, key: str, value: Any, expected: str
+) -> RecordingError:
     name = f"{label}.{key}"
     return RecordingError(place, f"{name} = {value!r}", expected, f"correcting {FILE}", column=name)

@@ -51,8 +51,10 @@ def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
             "another file",
         )
     time_ns = np.round(np.arange(len(data)) * (NANOSECONDS / sampling_hz)).astype(np.int64)
-    imu, account = screening.imu(Place(file), time_ns, np.deg2rad(data[:, :3]), STANDARD_GRAVITY *
-    data[:, 3:]) info = {
+    imu, account = screening.imu(
+        Place(file), time_ns, np.deg2rad(data[:, :3]), STANDARD_GRAVITY * data[:, 3:]
+    )
+    info = {
         "sampling_rate_hz": sampling_hz,
         "assumptions": [
             "Columns are the gyroscope about x, y, z in deg/s and the accelerometer along x, y, z in g"

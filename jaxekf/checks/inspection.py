@@ -34,6 +34,7 @@ _LONG_IMU_GAP_S = 0.5
 _GRAVITY_OFF, _RATE_OFF = 0.05, 0.05
 _SEEN_TOO_LITTLE = 0.5
 _EXPECTED = ("blank", "hidden", "missing tool", "status ")
+_LAYOUT = ("cells are separated", "numbers have decimal commas")
 """Reasons that occur in good recordings, too: the tool was hidden."""
 
 Span = tuple[float, float]
@@ -143,6 +144,7 @@ def inspect(recording: Recording) -> Inspection:
             warnings.append(f"clock and frame could not be estimated: {error}")
     for label in streams:
         _add_row_accounts(recording, label, warnings, notes)
+    notes += _unread_files(recording)
     warnings += _timing_warnings(streams, found)
     warnings += [] if aligned is None else _clock_warnings(aligned)
     warnings += [] if faults else _unit_warnings(recording, found)
@@ -159,6 +161,18 @@ def inspect(recording: Recording) -> Inspection:
         _points(recording),
         images,
     )
+
+
+def _unread_files(recording: Recording) -> list[str]:
+    """Notes on sections of the description that look like streams and are none that is known."""
+    sections = [key for key, value in recording.info.items() if isinstance(value, dict)]
+    folder = recording.path
+    return [
+        f"{key}.csv is not read: [{key}] is no stream of this process; register its schema"
+        " (jaxekf.io.register)"
+        for key in sections
+        if folder is not None and (folder / f"{key}.csv").is_file()
+    ]
 
 
 def _stream(recording: Recording, label: str) -> StreamSummary:
@@ -241,14 +255,15 @@ def _gaps(time_ns: Times, begin: Any, end: Any) -> Gaps:
 def _add_row_accounts(
     recording: Recording, label: str, warnings: list[str], notes: list[str]
 ) -> None:
-    """Add the account of rows: hidden tools become notes, everything else warnings."""
+    """Add the account of rows: hidden tools and the layout of the file are notes, everything else
+    warnings."""
     account = recording.intake.get(label)
     if account is None:
         return
     count = len(account.masked)
     for i, text in enumerate(account.sentences(label)):
-        name = list(account.masked)[i] if i < count else ""
-        (notes if name.startswith(_EXPECTED) else warnings).append(text)
+        name = list(account.masked)[i] if i < count else text.partition(": ")[2]
+        (notes if name.startswith((*_EXPECTED, *_LAYOUT)) else warnings).append(text)
 
 
 def _timing_warnings(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:

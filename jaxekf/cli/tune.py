@@ -337,7 +337,7 @@ def _print_known(tuned: tuning.Tuned) -> None:
     for label, ends in tuned.intervals.items():
         rows.append([label, *(f"{end:.5g}" for end in ends), first[label]])
     print_table(
-        "Confidence intervals (SI, before the common scale)",
+        "Confidence intervals (SI, before the final scaling of Q, R and P0)",
         ["number", "tuned", "95 %: from", "to", "moved by"],
         rows,
     )

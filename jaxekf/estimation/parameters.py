@@ -14,6 +14,7 @@ from jaxekf._support.errors import ModelError, RecordingError
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.io.atomic import write_whole
 from jaxekf.io.run_folder import SCHEMA_VERSION
+from jaxekf.models import get_model
 
 _SECTIONS = ("noise", "calibration", "initial")
 
@@ -144,13 +145,13 @@ def _write(
     write_whole(file, tomli_w.dumps({key: document[key] for key in kept}))
 
 
-def load(model: Model, *paths: Path | str) -> Parameters:
+def load(model: str | Model, *paths: Path | str) -> Parameters:
     """The model's default parameters, with the values of files in place of the defaults.
 
     Parameters
     ----------
     model
-        The model. The files must name it.
+        The model or its name. The files must name it.
     paths
         Files such as `noise.toml` and `calibration.toml`, or folders with these files; a later file
         overrides an earlier one.
@@ -167,6 +168,7 @@ def load(model: Model, *paths: Path | str) -> Parameters:
     ModelError
         A file is of another model, or a standard deviation is not positive and finite.
     """
+    model = get_model(model)
     params = model.parameters
     for path in map(Path, paths):
         files = [path]

@@ -26,7 +26,10 @@ def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> N
         )
     if not overwrite:
         raise RecordingError(
-            target, "a path that exists", "a new one", "another output or the overwrite option"
+            target,
+            "a path that exists",
+            "a new one",
+            "another output or --overwrite (in Python overwrite=True)",
         )
 
 
@@ -121,7 +124,10 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         if target.is_dir():
             got = "a folder"
         elif target.is_file():
-            got, hint = "a file that exists", "another path or the overwrite option"
+            got, hint = (
+                "a file that exists",
+                "another path or --overwrite (in Python overwrite=True)",
+            )
         raise RecordingError(target, got, "a new file", hint)
     temporary.sweep(target)
     made = temporary.beside(target, target.suffix)
@@ -172,7 +178,10 @@ def check_file(path: Path | str, marker: str, *, overwrite: bool = False) -> Non
         )
     if not overwrite:
         raise RecordingError(
-            target, "a file that exists", "a new one", "another output or the overwrite option"
+            target,
+            "a file that exists",
+            "a new one",
+            "another output or --overwrite (in Python overwrite=True)",
         )
 
 

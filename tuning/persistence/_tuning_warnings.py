@@ -98,8 +98,11 @@ def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
         if bounds is None or value is None:
             continue
         for bound, which in zip(bounds, ("lower", "upper"), strict=True):
-            # For a logarithm 1 % of the bound, else 1 % of the interval between both.
+            # 1 % of the bound for a logarithm, else of the interval between both or of the way from the
+            # start.
             reach = abs(bound) if number["logarithm"] else bounds[1] - bounds[0]
+            if not number["logarithm"] and number["start"] is not None:
+                reach = min(reach, abs(number["start"] - bound))
             if abs(value - bound) <= _NEAR_BOUND * reach:
                 yield (
                     f"{called(number)} is at its {which} bound ({bound:.5g} {number['unit']}): the data"

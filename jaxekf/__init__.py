@@ -6,7 +6,7 @@ Begin with ``jaxekf.set_up()``: it sets JAX to float64 and its compiler to what 
 from typing import TYPE_CHECKING
 
 from jaxekf._support.deprecations import keep_old_names
-from jaxekf._support.lazy import attributes
+from jaxekf._support.lazy import attributes, type_checked
 
 if TYPE_CHECKING:
     from jaxekf._support.compilation import jit, set_up
@@ -134,124 +134,7 @@ __all__ = [
     "timeline",
 ]
 
-_PLACES = {
-    "jaxekf._support.compilation": (
-        "jit",
-        "set_up",
-    ),
-    "jaxekf._support.errors": (
-        "CacheError",
-        "FilterError",
-        "JaxekfError",
-        "MissingPackageError",
-        "ModelError",
-        "PrecisionError",
-        "RecordingError",
-        "ResourceError",
-        "SlowModelWarning",
-        "TuningError",
-    ),
-    "jaxekf._support.program_cache": ("keep_programs",),
-    "jaxekf.estimation": ("timeline",),
-    "jaxekf.estimation.batch": (
-        "estimate",
-        "estimate_many",
-    ),
-    "jaxekf.estimation.causal": ("estimate_online",),
-    "jaxekf.estimation.live": (
-        "Known",
-        "Stream",
-    ),
-    "jaxekf.estimation.output_times": (
-        "Every",
-        "every",
-    ),
-    "jaxekf.estimation.parameters": (
-        "load_parameters",
-        "save_parameters",
-    ),
-    "jaxekf.estimation.result": (
-        "Estimate",
-        "OutputEstimate",
-        "SensorRecord",
-    ),
-    "jaxekf.evaluation.consistency": (
-        "Consistency",
-        "Whiteness",
-    ),
-    "jaxekf.evaluation.diagnosis": (
-        "Diagnosis",
-        "SensorDiagnosis",
-        "diagnose",
-        "diagnose_many",
-    ),
-    "jaxekf.evaluation.metrics": (
-        "Score",
-        "score",
-    ),
-    "jaxekf.evaluation.verdicts": (
-        "Fault",
-        "Verdict",
-    ),
-    "jaxekf.filtering.ekf": (
-        "FilterOutput",
-        "initial_belief",
-        "run_filter",
-        "run_filter_batch",
-    ),
-    "jaxekf.filtering.interpolation": ("InputSample",),
-    "jaxekf.filtering.iterated_smoother": (
-        "IteratedOutput",
-        "run_iterated_smoother",
-        "run_iterated_smoother_batch",
-    ),
-    "jaxekf.filtering.model": (
-        "Belief",
-        "Input",
-        "Model",
-        "Output",
-        "Parameters",
-        "Sensor",
-        "Start",
-    ),
-    "jaxekf.filtering.smoother": (
-        "SmootherOutput",
-        "run_smoother",
-        "run_smoother_batch",
-    ),
-    "jaxekf.filtering.steps": (
-        "Knots",
-        "Rows",
-        "Steps",
-    ),
-    "jaxekf.geometry.manifold": (
-        "SO3",
-        "AdditiveQuaternion",
-        "Euclidean",
-        "Manifold",
-    ),
-    "jaxekf.io.export": ("read_export",),
-    "jaxekf.io.run_folder": (
-        "load",
-        "save",
-    ),
-    "jaxekf.models": ("get_model",),
-    "jaxekf.models.robust": ("robust",),
-    "jaxekf.recordings.gaps": ("split_at_gaps",),
-    "jaxekf.recordings.types": (
-        "Camera",
-        "Encoder",
-        "Imu",
-        "Markers",
-        "Optical",
-        "Recording",
-        "Samples",
-    ),
-    "jaxekf.simulation": ("demo",),
-}
-_RENAMED = {"load_parameters": "load", "save_parameters": "save"}
-
 keep_old_names()
 if not TYPE_CHECKING:
     # Hidden from type checkers, which would take any name for one that is there.
-    __getattr__, __dir__ = attributes(__name__, _PLACES, _RENAMED)
+    __getattr__, __dir__ = attributes(__name__, type_checked(__file__))

@@ -12,7 +12,7 @@ Examples
 
 from typing import TYPE_CHECKING
 
-from jaxekf._support.lazy import attributes
+from jaxekf._support.lazy import attributes, type_checked
 
 if TYPE_CHECKING:
     from tuning.comparison.baselines import BASELINES
@@ -87,35 +87,6 @@ __all__ = [
     "with_axes",
 ]
 
-_PLACES = {
-    "tuning.comparison.baselines": ["BASELINES"],
-    "tuning.comparison.compare": ["compare"],
-    "tuning.comparison.cross_validation": ["Limits", "cross_validate"],
-    "tuning.objective.data": ["Data", "prepare"],
-    "tuning.objective.fisher_information": ["Information"],
-    "tuning.objective.objectives": [
-        "Objective",
-        "attitude_error",
-        "evaluate",
-        "innovation_likelihood",
-        "rate_error",
-    ],
-    "tuning.parametrisation.free_toml": ["read_free"],
-    "tuning.parametrisation.free_vector": ["Free", "Layout", "layout", "scaled", "with_axes"],
-    "tuning.parametrisation.truth_frame": ["TruthFrame"],
-    "tuning.persistence.fold_checkpoint": ["forget_folds"],
-    "tuning.persistence.tuning_document": ["save_record"],
-    "tuning.persistence.tuning_folder": ["save"],
-    "tuning.results.comparison": ["Comparison", "Row", "mean_by_variant"],
-    "tuning.results.fitted": ["Fitted"],
-    "tuning.results.held_out": ["CrossValidation", "Fold", "ParameterSpread", "Spread", "Work"],
-    "tuning.results.searched": ["Searched"],
-    "tuning.results.tuned": ["Iteration", "Outcome", "Tuned"],
-    "tuning.search.derivative_free": ["tune_by_coordinates", "tune_by_nelder_mead"],
-    "tuning.search.optimisers": ["LBFGS", "Adam", "FisherScoring"],
-    "tuning.tuner": ["fit_runs", "tune"],
-}
-
 if not TYPE_CHECKING:
     # Hidden from type checkers, which would accept any name.
-    __getattr__, __dir__ = attributes(__name__, _PLACES, old_names={"BESIDE": "BASELINES"})
+    __getattr__, __dir__ = attributes(__name__, type_checked(__file__), {"BESIDE": "BASELINES"})

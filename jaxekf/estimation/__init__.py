@@ -4,11 +4,12 @@
 as they arrive. `result` holds the estimate and writes the result folder.
 """
 
-from jaxekf._support.lazy import attributes
+from jaxekf._support.lazy import attributes, names_of
 
 # Functions that were here while this room was one module.
 _BATCH = ("estimate", "estimate_many", "read", "require_float64", "sharing_devices")
 __getattr__, __dir__ = attributes(
     __name__,
-    {"jaxekf.estimation.batch": _BATCH, "jaxekf.estimation.versions": ("provenance",)},
+    names_of("jaxekf.estimation.batch", *_BATCH)
+    | names_of("jaxekf.estimation.versions", "provenance"),
 )

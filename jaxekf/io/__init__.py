@@ -5,13 +5,11 @@ program goes into `importers`; a new stream is one file in `streams`, with its `
 unit is an entry in `units`; a new entry of every stream's section goes into `_section_entries`.
 """
 
-from jaxekf._support.lazy import attributes
+from jaxekf._support.lazy import attributes, names_of
 
 __getattr__, __dir__ = attributes(
     __name__,
-    {
-        "jaxekf.io.export": ("read_export",),
-        "jaxekf.io.run_folder": ("load", "load_imu", "save"),
-        "jaxekf.io.streams": ("register",),
-    },
+    names_of("jaxekf.io.export", "read_export")
+    | names_of("jaxekf.io.run_folder", "load", "load_imu", "save")
+    | names_of("jaxekf.io.streams", "register"),
 )

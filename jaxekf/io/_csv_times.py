@@ -36,7 +36,7 @@ def scaled(text: str, unit_ns: Decimal) -> int:
     if not value.is_finite() or value.adjusted() > 20:
         raise ValueError(text)
     value = (value * unit_ns).to_integral_value()
-    if abs(value) > _LARGEST_NS:
+    if not -_LARGEST_NS - 1 <= value <= _LARGEST_NS:
         raise ValueError(text)
     return int(value)
 

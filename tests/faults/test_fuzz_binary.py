@@ -26,7 +26,7 @@ PATIENCE_S = 20.0
 WITHOUT_JAX = """
 import pathlib, runpy, sys, types
 package = types.ModuleType("jaxekf")
-package.__path__ = [str(pathlib.Path(sys.argv[1]).parent)]
+package.__path__ = [str(pathlib.Path(sys.argv[1]).parents[1])]
 sys.modules["jaxekf"] = package
 runpy.run_path(sys.argv[2], run_name="__main__")
 """

@@ -16,6 +16,7 @@ from jaxekf._support.errors import RecordingError
 from jaxekf.io import _section_entries as section_entries
 from jaxekf.io import units
 from jaxekf.io.csv_table import (
+    QUATERNION,
     Sheet,
     Table,
     flags,
@@ -87,6 +88,32 @@ def latency() -> Field:
     """The latency of a stream whose samples arrive late."""
     about = "delay of the stamps after the measurement (default 0)"
     return Field(COUNT, (), "ns", about=about, option="latency")
+
+
+def attitude(about: str, *, hideable: bool = False) -> Field:
+    """The quaternions of a stream, body to reference."""
+    return Field(
+        shape=("N", 4),
+        unit="1",
+        frame=facts.BODY_TO_REFERENCE,
+        needed=True,
+        columns=QUATERNION,
+        about=about,
+        hideable=hideable,
+    )
+
+
+def validity() -> Field:
+    """The flags of a stream's usable samples; blank cells say the same in CSV files."""
+    return Field(FLAG, unit="1", about="whether the sample is usable")
+
+
+def triple(head: str, unit: str, frame: str, about: str, *, needed: bool = False) -> Field:
+    """A vector with the columns `head` and x, y, z."""
+    columns = tuple(f"{head}{axis}" for axis in "xyz")
+    return Field(
+        shape=("N", 3), unit=unit, frame=frame, needed=needed, columns=columns, about=about
+    )
 
 
 Screen = Callable[[Place, Mapping[str, Any], bool], tuple[Any, Intake]]

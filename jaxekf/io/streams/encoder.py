@@ -21,7 +21,7 @@ from jaxekf.io.csv_table import (
     stamps,
     whole_or_blank,
 )
-from jaxekf.io.schema import FLAG, Field, Option, StreamSchema
+from jaxekf.io.schema import FLAG, Field, Option, StreamSchema, attitude, validity
 from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Encoder, Floats, from_scipy, to_scipy
@@ -137,15 +137,10 @@ SCHEMA = StreamSchema(
     "encoder",
     "Truth from a robot's joints: attitude, and maybe position, in the tracker's reference frame.",
     {
-        "q_ref_body": Field(
-            shape=("N", 4),
-            unit="1",
-            frame=facts.BODY_TO_REFERENCE,
-            needed=True,
-            columns=QUATERNION,
-            about="attitude, in the encoder's frame; or the column `angle` of one joint, rad",
+        "q_ref_body": attitude(
+            "attitude, in the encoder's frame; or the column `angle` of one joint, rad"
         ),
-        "valid": Field(FLAG, unit="1", about="whether the sample is usable"),
+        "valid": validity(),
         "scored": Field(
             FLAG,
             unit="1",

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxekf.io import description
-from jaxekf.io.csv_table import POSITION, QUATERNION
-from jaxekf.io.schema import FLAG, TEXT, Field, Option, StreamSchema, latency
+from jaxekf.io.csv_table import POSITION
+from jaxekf.io.schema import TEXT, Field, Option, StreamSchema, attitude, latency, validity
 from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Optical
@@ -42,16 +42,8 @@ SCHEMA = StreamSchema(
     "optical",
     "Attitude, and often position, of the tool in the tracker's reference frame.",
     {
-        "q_ref_body": Field(
-            shape=("N", 4),
-            unit="1",
-            frame=facts.BODY_TO_REFERENCE,
-            needed=True,
-            columns=QUATERNION,
-            about="attitude; blank where the tool was not seen",
-            hideable=True,
-        ),
-        "valid": Field(FLAG, unit="1", about="whether the sample is usable"),
+        "q_ref_body": attitude("attitude; blank where the tool was not seen", hideable=True),
+        "valid": validity(),
         "position": Field(
             shape=("N", 3),
             unit="m",

@@ -55,6 +55,15 @@ def test_links_between_pages(page):
             assert heading in slugs, f"{page.name}: {link}"
 
 
+def test_modules_that_are_named_exist():
+    """A page on the design that names a module which has moved."""
+    text = (DOCS / "how-it-works.md").read_text("utf-8")
+    named = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", text, re.M)
+    modules = {file.stem for file in (ROOT / "jaxekf" / "filtering").rglob("*.py")}
+    names = {name.strip("` ") for row in named for name in row.split(",")}
+    assert len(names) > 10 and names <= modules, names - modules
+
+
 def test_gallery_pages_that_are_named_exist():
     """A link to an example that was renamed."""
     examples = {file.stem for file in (DOCS / "gallery").glob("plot_*.py")}

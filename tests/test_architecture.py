@@ -133,11 +133,13 @@ def test_rooms_say_what_they_hold():
 
 @pytest.mark.parametrize("file", FILES, ids=module_name)
 def test_who_may_know_what(file):
-    """Would catch matplotlib outside plots, plotly outside report, HDF5 outside exports, optax outside
-    tuning, and tuning outside the command line."""
+    """Would catch matplotlib outside plots, plotly and jinja2 outside report, HDF5 outside exports, msgspec
+    outside documents, optax outside tuning, and tuning outside the command line."""
     name, tops = module_name(file), {m.split(".")[0] for m in imports(file)}
     assert "matplotlib" not in tops or name.startswith("jaxekf.reporting.plots")
-    assert "plotly" not in tops or name.startswith("jaxekf.reporting.report")
+    assert not ({"plotly", "jinja2"} & tops) or name.startswith("jaxekf.reporting.report")
+    documents = ("jaxekf.io.documents", "jaxekf.cli.align", "jaxekf.reporting.report")
+    assert "msgspec" not in tops or name.startswith(documents)
     assert "optax" not in tops or name.startswith("tuning")
     assert "h5py" not in tops or name in ("jaxekf.io.export", "jaxekf.io._container_arrays")
     assert "tuning" not in tops or name.startswith(("tuning", "jaxekf.cli"))

@@ -256,7 +256,8 @@ class Stream:
         return Rows(value, aux, mask, np.full((len(instants), 1), self._period(sensor.name)))
 
     def _period(self, sensor: str) -> float:
-        """Median period of the sensor's samples within the horizon, s; used only by `Model.patience_s`."""
+        """Median period of the sensor's samples within the horizon, s; used only by
+        `Model.gate_reset_after_s`."""
         times = sorted(t for t, s in self._samples.items() if sensor in s)
         return float(np.median(np.diff(times))) / NANOSECONDS if len(times) > 1 else 0.0
 

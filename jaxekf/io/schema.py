@@ -104,7 +104,7 @@ def attitude(about: str, *, hideable: bool = False) -> Field:
 
 
 def validity() -> Field:
-    """The flags of a stream's usable samples; blank cells say the same in CSV files."""
+    """Flags of the usable samples of a stream; CSV files have blank cells for the others instead."""
     return Field(FLAG, unit="1", about="whether the sample is usable")
 
 

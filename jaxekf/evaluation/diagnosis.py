@@ -134,6 +134,18 @@ def diagnose_many(
 ) -> Diagnosis:
     """Judge several runs together, which finds smaller faults; each run keeps its own bias.
 
+    Parameters
+    ----------
+    estimates
+        Estimates of whole runs by one model.
+    recordings
+        Their recordings in the same order, if they have encoders.
+
+    Returns
+    -------
+    Diagnosis
+        Verdicts on all runs together, each with size, unit and standard deviation.
+
     Raises
     ------
     ValueError

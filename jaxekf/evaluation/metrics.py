@@ -117,6 +117,20 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
     body's origin in the reference frame.
 
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    recording
+        Its recording, with an encoder.
+    burn_in_s
+        Seconds at the start that do not count.
+
+    Returns
+    -------
+    Score
+        RMSE in deg, deg/s and mm; NEES divided by its degrees of freedom.
+
     Raises
     ------
     RecordingError

@@ -95,7 +95,20 @@ class FilterOutput(NamedTuple):
 
 
 def initial_belief(model: Model, params: Parameters, first: Mapping[str, Any]) -> Belief:
-    """The belief at the start of a run: mean from its first samples, covariance from the parameters."""
+    """The belief at the start of a run.
+
+    Parameters
+    ----------
+    model, params
+        The model and its parameters.
+    first
+        First visible sample of each sensor by name (`Timeline.first`).
+
+    Returns
+    -------
+    Belief
+        Mean from the first samples, covariance (n, n) from ``params.initial``.
+    """
     return Belief(model.initial_mean(first), model.initial_covariance(params))
 
 

@@ -87,9 +87,24 @@ def run_iterated_smoother(
 ) -> IteratedOutput:
     """The most probable path of one run, from an initial belief; differentiable in everything.
 
-    The iteration starts at the smoothed path; samples that the filter's gates rejected stay rejected. For a
-    tracker 3 to 5 `iterations` of Gauss-Newton suffice; `IteratedOutput.moved` shows whether they did. The
-    other arguments are those of `run_smoother`.
+    The iteration starts at the smoothed path; samples that the filter's gates rejected stay rejected.
+
+    Parameters
+    ----------
+    model, params, belief, steps, adjoint
+        As in `run_smoother`.
+    iterations
+        Number of Gauss-Newton steps; 3 to 5 suffice for a tracker.
+
+    Returns
+    -------
+    IteratedOutput
+        The path and its covariances; `moved` has the last step sizes.
+
+    Raises
+    ------
+    ModelError
+        For a model with robust weighting, and as `run_smoother`.
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
     found = run_iterated_smoother_batch(model, *one, iterations=iterations, adjoint=adjoint)

@@ -39,7 +39,20 @@ def run_smoother(
 ) -> SmootherOutput:
     """Filter and smooth one run from an initial belief; differentiable in everything.
 
-    Samples that the filter's gates rejected stay rejected. Arguments and errors are those of `run_filter`.
+    Parameters
+    ----------
+    model, params, belief, steps, adjoint
+        As in `run_filter`. Samples that the filter's gates rejected stay rejected.
+
+    Returns
+    -------
+    SmootherOutput
+        Smoothed beliefs, and the filter's output, with leading axes (K, S).
+
+    Raises
+    ------
+    ModelError
+        As `run_filter`.
 
     Examples
     --------
@@ -70,7 +83,22 @@ def run_smoother_batch(
 ) -> SmootherOutput:
     """Filter and smooth many runs: every leaf of every argument carries the runs on its first axis.
 
-    Equal to calls of `run_smoother` one by one; arguments and errors are those of `run_filter_batch`.
+    Equal to calls of `run_smoother` one by one.
+
+    Parameters
+    ----------
+    model, params, belief, steps, adjoint, devices
+        As in `run_filter_batch`.
+
+    Returns
+    -------
+    SmootherOutput
+        With leading axes (runs, K, S).
+
+    Raises
+    ------
+    ModelError
+        As `run_filter_batch`.
     """
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     filtered = ekf.run_filter_batch(

@@ -127,7 +127,17 @@ def read_export(path: Path | str) -> dict[str, Any]:
 
     Arrays have the bits that were written; single numbers are Python's, texts `str` and lists of `str`.
     ``time_ns`` and ``state/bias`` are entries, ``state/bias@unit`` an attribute of one, ``model`` an
-    attribute of the root. Raises `RecordingError` for a file that is none of ours.
+    attribute of the root.
+
+    Parameters
+    ----------
+    path
+        A file with the suffix ``.npz``, ``.h5`` or ``.hdf5``.
+
+    Raises
+    ------
+    RecordingError
+        For a file that `Estimate.export` has not written.
     """
     form = format_of(path)
     if form not in ("npz", "hdf5"):

@@ -33,15 +33,29 @@ __all__ = ["SCHEMA_VERSION", "load", "load_imu", "read_log", "save"]
 
 
 def load(path: Path | str, *, sort: bool = False) -> Recording:
-    """Read a recorded run. Raises `RecordingError`, which names file, line and column.
+    """Read a recorded run.
 
-    Further entries of `recording.toml` become `Recording.info`: its own entries by their names (see
-    `facts.known_entries`), and what is left of a stream's section as ``optical_about`` and so on. Rows that
-    must not be used are masked, and repeated rows are dropped: `Recording.intake` has the account.
-    With `sort` rows that are out of order are put in order of time.
+    Rows that must not be used are masked, and repeated rows are dropped; `Recording.intake` has the
+    account.
 
-    The streams must agree in units, order of quaternions and times
-    (`plausible.require`); ``trust_units = true`` in `recording.toml` leaves that out.
+    Parameters
+    ----------
+    path
+        A run folder, or a run in one file (``.h5``, ``.hdf5``, ``.npz``).
+    sort
+        Sort rows that are out of order by time, instead of refusing the file.
+
+    Returns
+    -------
+    Recording
+        Streams in SI units, times in int64 nanoseconds. Further entries of `recording.toml` are in `info`
+        (see `facts.known_entries`), the rest of a stream's section as ``optical_about`` and so on.
+
+    Raises
+    ------
+    RecordingError
+        For a fault in a file, with file, line and column; and if streams contradict each other in
+        units, order of quaternions or times, unless `recording.toml` has ``trust_units = true``.
 
     Examples
     --------
@@ -176,10 +190,23 @@ def save(
 ) -> Path:
     """Write a run as a folder; what is hidden becomes blank cells. Returns the folder.
 
-    `load` gives the same run again; with fewer `digits`, its samples rounded. With `hashes` the SHA-256 of
-    every file is in `recording.toml`, and `load` refuses files that were changed since. Raises
-    `RecordingError`
-    where the folder may not be written, or the run could not be read again.
+    Parameters
+    ----------
+    recording
+        The run. `load` gives the same run again.
+    path
+        The folder, or one file by its suffix (``.h5``, ``.hdf5``, ``.npz``), which keeps every bit.
+    overwrite
+        Replace an earlier run.
+    digits
+        Significant digits of samples in a folder.
+    hashes
+        Write the SHA-256 of every file into `recording.toml`; `load` then refuses files that were changed.
+
+    Raises
+    ------
+    RecordingError
+        If the folder cannot be written, or if the run could not be read again.
 
     Examples
     --------

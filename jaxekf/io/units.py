@@ -10,7 +10,7 @@ from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.io._section_entries import wrong_entry
 from jaxekf.recordings.types import Floats
 
-UNITS: Mapping[str, Mapping[str, float]] = {
+UNITS: Mapping[str, dict[str, float]] = {
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "rad/s": {"rad/s": 1.0, "deg/s": np.pi / 180.0},
     "m/s^2": {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mm/s^2": 1e-3},

@@ -1,9 +1,9 @@
 """The models that come with the package, by name.
 
-Choose `loose` for a tracker that reports attitudes, `loose_pose` for one that reports poses, `tight` for
-single markers, `visual` for landmarks in images, and `marg` without a tracker; each module begins with its
-states, sensors, parameters and source. A new model is a file here: every `Model` of a
-public module is found.
+Choose `loose` for a tracker that reports attitudes, `loose_pose` for one that reports poses, `tight`
+for single markers, `visual` for landmarks in images, and `marg` without a tracker; each module begins
+with its states, sensors, parameters and source. `inertial` is what the pose models share. A new model
+is a file here: every `Model` of a public module is found.
 """
 
 import importlib

@@ -2,5 +2,5 @@
 
 `types` has the streams and `Recording`; `screening` decides which samples are valid; `accounts` counts
 what became of every row. A new stream that a model of one's own reads needs no change here: see
-`jaxekf.io.schemas`.
+`jaxekf.io.streams`.
 """

@@ -51,7 +51,21 @@ def prepare(
 ) -> Data:
     """Timelines, initial means and truth of runs, stacked and padded to one length.
 
-    Raises `TuningError` without any run, or if truth is needed and none is scored.
+    Parameters
+    ----------
+    model
+        The model.
+    runs
+        Recordings or paths of runs.
+    burn_in_s
+        Seconds at the start of each run that do not count.
+    need_truth
+        Whether at least one run must have an encoder.
+
+    Raises
+    ------
+    TuningError
+        Without any run, or if truth is needed and none is scored.
     """
     recordings, lines = _read(model, runs)
     data = _stack(model, recordings, lines, burn_in_s, range(len(lines)))

@@ -176,8 +176,17 @@ def evaluate(
 ) -> Array:
     """The objective of all runs with the same parameters, a scalar with a gradient to each of them.
 
-    Samples of all runs are pooled, so that a longer run weighs more. If `data` is one group of several,
-    `counts` are those of `count` over all groups: the values of the groups then add up to that of all.
+    Samples of all runs are pooled, so that a longer run has more weight.
+
+    Parameters
+    ----------
+    model, objective, params
+        The model, the objective, and one set of parameters for all runs.
+    data
+        The runs, of `prepare`.
+    counts
+        If `data` is one group of several, those of `count` over all groups: the values of the groups
+        then add up to that of all.
     """
     return evaluate_each(model, objective, shared(params, data), data, counts)
 

@@ -18,7 +18,15 @@ _KEYS = {
 def read_free(path: Path | str) -> list[Free]:
     """The ``[[free]]`` tables of a file: ``name`` and optional ``each_run``, ``prior`` and ``bounds``.
 
-    Raises `TuningError` for a file that has anything else.
+    Parameters
+    ----------
+    path
+        A TOML file.
+
+    Raises
+    ------
+    TuningError
+        For a file that has anything else.
     """
     try:
         document = tomllib.loads(Path(path).read_text("utf-8-sig"))

@@ -214,8 +214,19 @@ class Problem:
 def tune_by_coordinates(
     runs: Sequence[Run], *, sweeps: int = 20, **options: Unpack[SearchOptions]
 ) -> Searched:
-    """Tune by `coordinate_search`; the other arguments, defaults and errors are those of `tune`.
+    """Tune by `coordinate_search`, without gradients.
 
+    Parameters
+    ----------
+    runs
+        Recordings or paths of runs.
+    sweeps
+        Number of passes over all numbers.
+    **options
+        Arguments of `tune` with its defaults; errors are those of `tune`, too.
+
+    Notes
+    -----
     The first steps are 10 % of a deviation, 10 % of the row's diagonal entry below the diagonal of a full
     matrix, and the natural unit of a calibration (5 ms, 0.01 rad, 1 %, 1 cm, 10 ppm).
     """
@@ -227,9 +238,17 @@ def tune_by_coordinates(
 def tune_by_nelder_mead(
     runs: Sequence[Run], *, evaluations: int = 1_000, **options: Unpack[SearchOptions]
 ) -> Searched:
-    """Tune by `nelder_mead` on the free vector, in which deviations are logarithms; the other arguments,
-    defaults and errors are those of `tune`. The steps of the first simplex are those of
-    `tune_by_coordinates`."""
+    """Tune by `nelder_mead` on the free vector, in which deviations are logarithms.
+
+    Parameters
+    ----------
+    runs
+        Recordings or paths of runs.
+    evaluations
+        Largest number of evaluations of the objective.
+    **options
+        As in `tune_by_coordinates`, whose first steps span the first simplex.
+    """
     problem = Problem(runs, **options)
     found = problem.by_nelder_mead(evaluations)
     return problem.searched(found, problem.scale(found))

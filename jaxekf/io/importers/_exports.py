@@ -15,11 +15,12 @@ from jaxekf._support.errors import RecordingError
 from jaxekf.io._csv_content import Content, read_content
 from jaxekf.io._csv_text import DELIMITERS, read_rows, split_line
 from jaxekf.io.csv_table import Table, numbers
+from jaxekf.io.units import UNITS
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Intake, Reason
 from jaxekf.recordings.types import Flags, Floats, Optical, Recording, Times
 
-METRES = {"m": 1.0, "meters": 1.0, "cm": 0.01, "centimeters": 0.01, "mm": 1e-3, "millimeters": 1e-3}
+METRES = UNITS["m"] | {"meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3}
 """Metres in a unit of length."""
 LARGEST = 1e20
 """A larger number marks a missing value (NDI writes -3.697314e28)."""

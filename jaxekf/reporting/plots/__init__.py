@@ -1,8 +1,10 @@
 """Figures of an estimate, with the measurements and the truth of its recording.
 
-A figure is a function of an estimate and its recording, in a private module of this package. Its decorator
-`_registry.figure` states which data it needs and registers it under its own name. Modules whose names
-begin with ``_`` are found without being listed. A new figure is one file, or one function, and its test.
+A figure is a function of an estimate and its recording, in a private module of this package. Its
+decorator `_registry.figure` states which data it needs and registers it under its own name. Modules
+whose names begin with ``_`` are found without being listed: `_attitudes` (attitude, occlusion),
+`_vectors` (position, velocity, rate), `_biases`, `_paths`, `_single_markers`. A new figure is one file,
+or one function, and its test.
 """
 
 from importlib import import_module

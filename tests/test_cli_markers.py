@@ -189,7 +189,11 @@ def test_online_of_a_model_that_only_looks_back(tmp_path):
     )
     assert done.exit_code == 1
     assert sum(line.startswith("Error: ") for line in done.output.splitlines()) == 1
-    for words in ("'loose_rate' without input", "loose, loose_pose, tight", "not online"):
+    for words in (
+        "'loose_rate' without input",
+        "loose, loose_pose, marg, tight, triad",
+        "not online",
+    ):
         assert words in done.output
     assert not (tmp_path / "o").exists()
 

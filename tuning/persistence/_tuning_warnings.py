@@ -98,12 +98,12 @@ def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
         if bounds is None or value is None:
             continue
         for bound, which in zip(bounds, ("lower", "upper"), strict=True):
-            # 1 % of the bound for a logarithm, else of the interval between both or of the way from the
-            # start.
-            reach = abs(bound) if number["logarithm"] else bounds[1] - bounds[0]
-            if not number["logarithm"] and number["start"] is not None:
-                reach = min(reach, abs(number["start"] - bound))
-            if abs(value - bound) <= _NEAR_BOUND * reach:
+            # For a logarithm 1 % of the bound, else 1 % of the interval between both.
+            reach = _NEAR_BOUND * (abs(bound) if number["logarithm"] else bounds[1] - bounds[0])
+            left, start = abs(value - bound), number["start"]
+            # A number that began near a bound of a wide interval and stayed there was not drawn to it.
+            drawn = start is None or left < 0.9 * abs(start - bound) or left < _NEAR_BOUND * reach
+            if left <= reach and drawn:
                 yield (
                     f"{called(number)} is at its {which} bound ({bound:.5g} {number['unit']}): the data"
                     " ask for more; widen the bounds, or look for what makes it go there"

@@ -340,7 +340,7 @@ def worse_fold(document):
         (change(1, bounds=[0.0009, 0.1]), ["clock_offset is at its lower bound (0.0009 s)"]),
         (change(1, bounds=[-0.001, 0.1]), []),
         # A number of a wide interval that stayed where it began is not drawn to a bound.
-        (change(1, bounds=[1.0, 1e6], start=100.0, tuned=100.0), []),
+        (change(1, bounds=[1.0, 1e6], start=100.0, tuned=100.0, written=100.0), []),
         (
             change(0, bounds=[0.001, 0.03], written=0.04),
             ["scale of all covariances (4) took noise.optical past the bounds"],

@@ -102,7 +102,7 @@ def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
             reach = _NEAR_BOUND * (abs(bound) if number["logarithm"] else bounds[1] - bounds[0])
             left, start = abs(value - bound), number["start"]
             # A number that began near a bound of a wide interval and stayed there was not drawn to it.
-            drawn = start is None or left < 0.9 * abs(start - bound) or left < _NEAR_BOUND * reach
+            drawn = start is None or left < 0.9 * abs(start - bound) or left < 1e-6 * reach
             if left <= reach and drawn:
                 yield (
                     f"{called(number)} is at its {which} bound ({bound:.5g} {number['unit']}): the data"

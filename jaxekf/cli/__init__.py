@@ -4,8 +4,6 @@ Each command is a module here, imported only when the command runs. A new comman
 in `_SUMMARIES`.
 """
 
-import os
-
 import click
 
 from jaxekf import __version__
@@ -44,8 +42,6 @@ def main() -> None:
     A run is a folder with recording.toml, imu.csv and optical.csv, markers.csv or camera.csv with
     landmarks.csv; encoder.csv has the truth, if it is known.
     """
-    # XLA logs kilobytes for each program that it reads from the cache; failures come as exceptions.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     # The import of JAX takes most of a second; the help and the version end before it.
     from jaxekf._support.compilation import set_up
     from jaxekf.cli.machine import prepare

@@ -1,6 +1,7 @@
 """The group of commands: a command is imported when it runs, and its errors become messages of one line."""
 
 import errno
+import os
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -57,6 +58,9 @@ class LazyGroup(click.Group):
         return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def invoke(self, ctx: click.Context) -> Any:
+        # XLA logs kilobytes for each program that it reads from the cache; failures come as exceptions. It
+        # reads this when it is imported, with the command.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
         try:
             return super().invoke(ctx)
         except JaxekfError as error:

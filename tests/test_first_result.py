@@ -150,6 +150,28 @@ def test_old_names_are_found_for_one_release():
     assert run_python(code) == ["jaxekf.geometry.rotation", True, True, {}, True, True]
 
 
+def renamed_in(file):
+    """The old names of what a module has renamed: the texts of its calls of `renamed`."""
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "renamed":
+            text = ast.literal_eval(node.args[1])
+            yield from (entry.partition(">")[0] for entry in text.split())
+
+
+def test_names_that_a_module_has_renamed_are_found():
+    """Would catch an old name that was changed along with the new one, or leads nowhere."""
+    found = 0
+    for file in sorted((ROOT / "jaxekf").rglob("*.py")):
+        name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        for old in renamed_in(file):
+            module = import_module(name)
+            assert old not in vars(module), f"{name}.{old}"
+            with pytest.warns(DeprecationWarning, match=rf"{old} is now .*next release"):
+                assert getattr(module, old) is not None
+            found += 1
+    assert found > 30
+
+
 def test_every_listed_command_is_there():
     """Would catch a line of the help for a command that cannot be imported or is called otherwise."""
     context = click.Context(main)

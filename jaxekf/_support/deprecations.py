@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from importlib import import_module
 from importlib.machinery import ModuleSpec
@@ -152,16 +152,23 @@ def warn_renamed(old: str, new: str, stacklevel: int = 2) -> None:
     )
 
 
+def _rename_keys(
+    options: dict[str, Any], renamed: Mapping[str, str], kind: str, owner: str
+) -> None:
+    """Put keyword arguments under their new names, with a warning at the line of the call."""
+    for old, new in renamed.items():
+        if old in options:
+            warn_renamed(f"the {kind} {old} of {owner}", new, stacklevel=3)
+            options[new] = options.pop(old)
+
+
 def renamed_arguments(**renamed: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Decorator of a function that takes keyword arguments under their old names too: ``old="new"``."""
 
     def decorated(function: Callable[P, T]) -> Callable[P, T]:
         @wraps(function)
         def call(*args: P.args, **options: P.kwargs) -> T:
-            for old, new in renamed.items():
-                if old in options:
-                    warn_renamed(f"the argument {old} of {function.__name__}", new)
-                    options[new] = options.pop(old)
+            _rename_keys(options, renamed, "argument", function.__name__)
             return function(*args, **options)
 
         return call
@@ -177,10 +184,7 @@ def renamed_fields(**renamed: str) -> Callable[[type[T]], type[T]]:
 
         @wraps(init)
         def __init__(self: Any, *args: Any, **options: Any) -> None:
-            for old, new in renamed.items():
-                if old in options:
-                    warn_renamed(f"the field {old} of {cls.__name__}", new)
-                    options[new] = options.pop(old)
+            _rename_keys(options, renamed, "field", cls.__name__)
             init(self, *args, **options)
 
         def reader(old: str, new: str) -> property:
@@ -243,11 +247,7 @@ def renamed(module: str, names: str) -> Callable[[str], Any]:
         if name not in places:
             raise AttributeError(f"module '{module}' has no attribute '{name}'", name=name)
         home, _, new = places[name].rpartition(".")
-        warnings.warn(
-            f"{module}.{name} is now {home or module}.{new}; the old name will be gone in the next release",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        warn_renamed(f"{module}.{name}", f"{home or module}.{new}")
         return getattr(import_module(home or module), new)
 
     return __getattr__

@@ -327,4 +327,4 @@ def _unit_warnings(recording: Recording, found: Evidence) -> list[str]:
     return warnings
 
 
-__getattr__ = renamed(__name__, "PointsFound>PointsSummary StreamSummary>StreamSummary")
+__getattr__ = renamed(__name__, "PointsFound>PointsSummary StreamFound>StreamSummary")

@@ -146,7 +146,7 @@ class BoundModel:
         call = partial(self._call, f"sensor {name}", function, x, u)
         if sensor.alike is None:
             return call(rows)
-        # A scan over the groups: cotangents of what they share are then summed one term at a time.
+        # A scan over the groups: cotangents of their shared inputs are then summed one term at a time.
         groups = repeated_groups.split_groups(rows, sensor.copies)
 
         def one(_: None, group: Any) -> tuple[None, Any]:

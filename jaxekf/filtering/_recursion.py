@@ -274,7 +274,7 @@ def _with_adjoint(
         chosen = [c for flag, c in zip(live, leaves, strict=True) if flag]
         back = _adjoint_of_runs(lowered, save, segment, devices, perturbed, live)
         total, first, of_inputs = back(starts, prepared, inputs, chosen)[0]
-        # When samples were rejected decides what is accepted, but nothing depends on it smoothly.
+        # The times of rejected samples decide which samples are accepted, but have no derivative.
         refused = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
         inputs_bar = cotangent_tree(inputs, perturbed.inputs, of_inputs)
         prepared_bar = cotangent_tree(prepared, perturbed.prepared, total)

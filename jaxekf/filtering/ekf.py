@@ -207,7 +207,7 @@ def run_filter_batch(
     """
     if keep not in _SAVE_SPECS:
         raise ModelError(
-            f"got keep='{keep}', expected one of {sorted(_SAVE_SPECS)}; choose what is to be kept"
+            f"got keep='{keep}', expected one of {sorted(_SAVE_SPECS)}; choose one of these"
         )
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     lowered, prepared, inputs = lower_model(model, params, belief, steps, relinearise)

@@ -76,10 +76,10 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
 
     The data sets that a schema needs must be there, and no unknown ones; other groups are not read. A
     type is read where no value changes by it: float32, small integers, any integer times that fit,
-    never times as floats. Where ``sha256`` is there it has to be that of the content, which then is
-    taken as it is: only rows hidden by ``valid`` (or ``visible``) are masked, and what is
-    not finite. Without it rows are judged as those of a CSV file are (`intake`), and with `sort` put in
-    order of time. `Recording.intake` has the account. Raises `RecordingError`.
+    never times as floats. If the file has ``sha256``, it must be that of the content, which is then
+    taken without screening: only rows hidden by ``valid`` (or ``visible``) and numbers that are not finite
+    are masked. Without it rows are screened like those of a CSV file (`screening`), and with `sort` sorted
+    by time. `Recording.intake` has the account. Raises `RecordingError`.
     """
     path = _known(path)
     data: dict[str, Any] = {}

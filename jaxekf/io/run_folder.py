@@ -90,10 +90,11 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
     sources = hashed(place)
+    known = section_keys()
     for label, schema in SCHEMAS.items():
         section = about.get(label, {})
         description.check_section(place, label, section, schema.described)
-        section_entries.check_keys(section, label, place, section_keys())
+        section_entries.check_keys(section, label, place, known)
         how = section_entries.layout(label, section, place)
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:

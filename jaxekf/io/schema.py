@@ -14,7 +14,6 @@ import numpy as np
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _section_entries as section_entries
-from jaxekf.io import units
 from jaxekf.io.csv_table import (
     QUATERNION,
     Sheet,
@@ -27,6 +26,7 @@ from jaxekf.io.csv_table import (
     words,
 )
 from jaxekf.io.description import Source, latency_entry, latency_ns
+from jaxekf.io.units import factors, scaled
 from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import PlainStream
@@ -230,7 +230,7 @@ class StreamSchema:
         scale = dict(
             zip(
                 self.units,
-                units.factors(self.name, self.units, section, place),
+                factors(self.name, self.units, section, place),
                 strict=True,
             )
         )
@@ -264,13 +264,13 @@ class StreamSchema:
             value, at = np.ascontiguousarray(every[:, at : at + len(names)]), at + len(names)
             one = self.fields[name]
             value = turning.standard(value) if one.frame == facts.BODY_TO_REFERENCE else value
-            found[name] = units.scaled(value, scale.get(one.unit, 1.0))
+            found[name] = scaled(value, scale.get(one.unit, 1.0))
         return found
 
     def _plain(
         self, place: Place, arrays: Mapping[str, Any], sort: bool
     ) -> tuple[PlainStream, Intake]:
-        """A stream of plain columns; rows without any finite field are masked and left out."""
+        """A stream of plain columns; rows without any finite field are masked."""
         values = {name: arrays[name] for name in self.fields if arrays.get(name) is not None}
         time_ns, late = values.pop("time_ns"), int(values.pop("latency_ns", 0))
         order, account = screening.in_order(place, time_ns, list(values.values()), sort=sort)

@@ -1,7 +1,6 @@
 """Result of a tuning by gradient."""
 
 import hashlib
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,6 +11,7 @@ import jax
 import numpy as np
 
 import tuning
+from jaxekf._support.deprecations import warn_renamed
 from jaxekf.estimation.batch import Run, read
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Flags, Floats
@@ -139,9 +139,5 @@ class Tuned:
 
     def save(self, folder: Path | str, **options: Any) -> None:
         """Deprecated: `tuning.save`."""
-        warnings.warn(
-            "Tuned.save is now tuning.save(tuned, folder); the method will be gone in the next release",
-            DeprecationWarning,
-            stacklevel=2,
-        )
+        warn_renamed("Tuned.save(folder)", "tuning.save(tuned, folder)")
         tuning.save(self, folder, **options)

@@ -99,7 +99,7 @@ def _plain_value(value: Any) -> Any:
         return str(value)
     if hasattr(value, "__array__"):
         return np.asarray(value).tolist()
-    raise NotImplementedError
+    raise NotImplementedError  # msgspec then names the type in its own error
 
 
 def _array(_: type, value: Any) -> Any:

@@ -180,7 +180,7 @@ def choose_streams(
     """The streams of the IMU and of the poses, as given or as preferred."""
     if path is None and (imu is None or pose is None):
         raise RecordingError(
-            "load", "no path", "a recording, or both imu= and pose=", "giving what is missing"
+            "load", "no path", "a recording, or both imu= and pose=", "giving the missing argument"
         )
     base = (_root(path) or path) if path is not None and path.is_dir() else None
     given = [None if value is None else _given(value, base) for value in (imu, pose)]

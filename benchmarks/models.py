@@ -39,7 +39,7 @@ _DT = 0.01
 
 def _markers() -> Model:
     """A test model with an accelerometer and a gyroscope, and the quality of a marker in `aux`."""
-    sensors = tuple(replace(sensor, aux_like=1.0) for sensor in toy_models.MARKERS.sensors)
+    sensors = tuple(replace(sensor, typical_aux=1.0) for sensor in toy_models.MARKERS.sensors)
     return replace(toy_models.MARKERS, sensors=sensors)
 
 
@@ -121,7 +121,7 @@ def _steps(model: Model, runs: int, count: int) -> Steps:
     rng = np.random.default_rng(3)
     fast = {}
     for sensor in model.sensors:
-        like = sensor.aux_like
+        like = sensor.typical_aux
         expected = sensor.predict(x, u, params, like)
         noise = jnp.asarray(1e-4 * rng.normal(size=(*shape, sensor.rows)))
         put = jax.jit(jax.vmap(partial(manifold.retract, sensor.space, expected)))

@@ -36,16 +36,16 @@ def problem(name, epochs):
         u = InputSample(rate[0], rate[0], np.array(100.0))
     fast, slow = {}, {}
     for sensor in model.sensors:
-        shape = (epochs,) if sensor.alike is not None else (epochs, substeps)
+        shape = (epochs,) if sensor.single_group is not None else (epochs, substeps)
 
         def every(leaf, shape=shape):
             return np.broadcast_to(leaf, (*shape, *np.shape(leaf))).astype(float)
 
-        aux = None if sensor.aux_like is None else sensor.aux_like
+        aux = None if sensor.typical_aux is None else sensor.typical_aux
         value = sensor.predict(x, u, params, aux)
         value, aux = jax.tree.map(every, (value, aux))
         rows = Rows(value, aux, np.ones((*shape, sensor.rows), bool), np.full(shape, 0.01))
-        (slow if sensor.alike is not None else fast)[sensor.name] = rows
+        (slow if sensor.single_group is not None else fast)[sensor.name] = rows
     steps = Steps(time, np.full(time.shape, 0.01), np.ones(time.shape, bool), knots, fast, slow)
     belief = Belief(x, model.initial_covariance(params))
     return model, params, belief, jax.tree.map(jnp.asarray, steps)

@@ -25,7 +25,7 @@ def correlated(params, aux, dt):
 def with_camera(point, count=4, *, whole=False):
     """The small toy model with another camera; `whole` takes all rows of an image at once."""
     camera = repeated(point, count)
-    camera = replace(camera, alike=None) if whole else camera
+    camera = replace(camera, single_group=None) if whole else camera
     return replace(toy_models.POINTS, sensors=(camera,))
 
 

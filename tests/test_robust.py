@@ -210,7 +210,7 @@ def test_what_a_result_tells(tmp_path):
 
 
 def test_old_names_work_for_one_release():
-    """A user's script with `means` or `patience_s` that breaks, or works without a warning."""
+    """Would catch a script with an old name of an argument or a field that breaks, or is not warned."""
     with pytest.warns(DeprecationWarning, match="outlier_method"):
         model = jaxekf.robust("loose", means="huber")
     assert model is jaxekf.robust("loose", "huber")
@@ -219,3 +219,8 @@ def test_old_names_work_for_one_release():
     assert changed.gate_reset_after_s == 2.0
     with pytest.warns(DeprecationWarning, match="gate_reset_after_s"):
         assert changed.patience_s == 2.0
+    (sensor,) = model.sensors
+    with pytest.warns(DeprecationWarning, match="typical_aux"):
+        assert dataclasses.replace(sensor, aux_like=1.0).typical_aux == 1.0
+    with pytest.warns(DeprecationWarning, match="single_group"):
+        assert sensor.alike is None

@@ -83,7 +83,7 @@ def test_both_forms_agree():
 
         @jax.jit
         def whitened(x, params, aux, value, model=model):
-            sensor = model.sensor("camera").alike
+            sensor = model.sensor("camera").single_group
 
             def residual(delta):
                 there = manifold.retract(model.space, x, delta)

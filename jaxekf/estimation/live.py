@@ -91,7 +91,7 @@ class Stream:
         self.dropped: dict[str, int] = {sensor.name: 0 for sensor in model.sensors}
         self._horizon_ns, self._capacity = round(horizon_s * NANOSECONDS), capacity
         self._belief = jax.tree.map(jnp.asarray, belief)
-        self._refused = jnp.zeros(())
+        self._rejecting_s = jnp.zeros(())
         self._base_ns, self._base_is_open = int(start_ns), True
         self._start_ns = int(start_ns)
         self._times: list[int] = []
@@ -170,7 +170,7 @@ class Stream:
             return False
         _check_shapes(definition, value)
         rows = np.broadcast_to(np.asarray(mask, bool), definition.rows)
-        aux = definition.aux_like if aux is None else aux
+        aux = definition.typical_aux if aux is None else aux
         self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
         return True
 
@@ -209,7 +209,7 @@ class Stream:
     def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
         """Filter over these instants, make the first `final` of them final, and return the last belief."""
         steps = self._steps(instants)
-        output, outputs = _advance(self.model, self.params, self._belief, self._refused, steps)
+        output, outputs = _advance(self.model, self.params, self._belief, self._rejecting_s, steps)
         count = len(instants)
         if not np.asarray(output.instants.healthy)[:count].all():
             raise FilterError(
@@ -218,8 +218,8 @@ class Stream:
             )
         if final:
             self._belief = jax.tree.map(lambda a: a[final - 1, 0], output.instants.updated)
-            if output.instants.refused is not None:
-                self._refused = output.instants.refused[final - 1, 0]
+            if output.instants.rejecting_s is not None:
+                self._rejecting_s = output.instants.rejecting_s[final - 1, 0]
             self._discard_before(instants[final - 1])
         last = jax.tree.map(lambda a: a[count - 1, 0], output.instants.updated)
         return last, jax.tree.map(lambda a: a[count - 1, 0], outputs)
@@ -246,7 +246,7 @@ class Stream:
     def _rows(self, sensor: Sensor, instants: list[int]) -> Rows:
         """A sensor's samples at these instants, masked at instants without one."""
         blank = _Sample(
-            _zeros(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.aux_like)
+            _zeros(sensor.space), np.zeros(sensor.rows, bool), _as_floats(sensor.typical_aux)
         )
         samples = [self._samples.get(t, {}).get(sensor.name, blank) for t in instants]
         value, mask, aux = (
@@ -287,11 +287,11 @@ def _as_floats(tree: Any) -> Any:
 
 @partial(jit, static_argnums=0)
 def _advance(
-    model: Model, params: Parameters, belief: Belief, refused: Any, steps: Steps
+    model: Model, params: Parameters, belief: Belief, rejecting_s: Any, steps: Steps
 ) -> tuple[ekf.FilterOutput, Mapping[str, Any]]:
     """Filter one window, and evaluate the model's outputs at its instants."""
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, rejecting_s))
     gated = any(sensor.gate is not None for sensor in model.sensors)
-    output = ekf.run_filter_batch(model, *one[:3], refused=one[3] if gated else None)
+    output = ekf.run_filter_batch(model, *one[:3], rejecting_s=one[3] if gated else None)
     outputs = evaluate_outputs(model, one[0], output)
     return jax.tree.map(lambda a: a[0], (output, outputs))

@@ -125,9 +125,9 @@ def find_faults(estimate: Estimate, sensor: str) -> Faults | None:
 def _noise_depends_on_vectors(estimate: Estimate, sensor: str) -> bool:
     """Whether the noise depends on vectors in the body frame, which no record keeps.
 
-    That noise rotates with the body, so the gain computed from `aux_like` would be wrong.
+    That noise rotates with the body, so the gain computed from `typical_aux` would be wrong.
     """
-    leaves = jax.tree.leaves(estimate.model.sensor(sensor).aux_like)
+    leaves = jax.tree.leaves(estimate.model.sensor(sensor).typical_aux)
     return any(np.ndim(leaf) > 0 for leaf in leaves)
 
 
@@ -145,7 +145,7 @@ def _gains(
     described = estimate.model.sensor(sensor)
     record = estimate.sensors[sensor]
     step = jnp.asarray(float(np.median(np.diff(record.time_ns))) / NANOSECONDS)
-    noise = np.asarray(described.noise(estimate.params, described.aux_like, step))
+    noise = np.asarray(described.noise(estimate.params, described.typical_aux, step))
     noise = noise[rows, rows]
     # H is the identity here: the gain is (S - R) inv(S) = P+ inv(R).
     gain = np.linalg.solve(cov, cov - noise).transpose(0, 2, 1)

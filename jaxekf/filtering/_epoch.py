@@ -32,7 +32,7 @@ class ScanInit(NamedTuple):
     """The start of a run."""
 
     belief: Belief
-    refused: Array | None = None
+    rejecting_s: Array | None = None
     """Seconds of rejected samples before the start, as in `FilterCarry`."""
 
 
@@ -50,7 +50,7 @@ class ScanOutputs(NamedTuple):
     """Likewise."""
     recovered: Array | None
     """(K, S) where the gates were reset; None without gates."""
-    refused: Array | None
+    rejecting_s: Array | None
     """(K, S) as in `FilterCarry`."""
 
 
@@ -73,7 +73,7 @@ def _select(save: SaveSpec, output: StepOutput) -> ScanOutputs:
         output.used if save.used else {},
         output.gated if save.used else {},
         output.recovered if save.used else None,
-        output.carry.refused if save.used else None,
+        output.carry.rejecting_s if save.used else None,
     )
 
 

@@ -46,7 +46,7 @@ class GatingResult(NamedTuple):
     """By sensor: gated rows hidden, noise of down-weighted rows inflated."""
     gated: dict[str, Array]
     """By sensor: (rows, lanes) visible rows that a gate rejected."""
-    refused: Array | None
+    rejecting_s: Array | None
     """(lanes,) as in `FilterCarry`; None without gates, as the next two."""
     recovered: Array | None
     """(lanes,) where the gates were reset."""
@@ -80,7 +80,7 @@ def gate_and_weight(
     linear: dict[str, LinearisedRows],
     samples: dict[str, Rows],
     prior_cov: Array,
-    refused: Array | None,
+    rejecting_s: Array | None,
 ) -> GatingResult:
     """Reject rows by gates, inflate the noise of others by weights, and reset gates that reject everything.
 
@@ -98,7 +98,7 @@ def gate_and_weight(
         The same sensors' samples.
     prior_cov
         Predicted covariance, (n, n, lanes).
-    refused
+    rejecting_s
         (lanes,) as in `FilterCarry`.
     """
     sensors = {name: lowered.sensors[name].sensor for name in linear}
@@ -108,7 +108,7 @@ def gate_and_weight(
         if sensors[name].gate is not None or sensors[name].weighting is not None
     }
     gated, after, recovered, inflation = _apply_gates(
-        lowered, linear, samples, prior_cov, refused, distances
+        lowered, linear, samples, prior_cov, rejecting_s, distances
     )
     kept = {name: _hide_rows(one, gated[name]) for name, one in linear.items()}
     for name in distances:
@@ -192,26 +192,26 @@ def _apply_gates(
     linear: dict[str, LinearisedRows],
     samples: dict[str, Rows],
     prior_cov: Array,
-    refused: Array | None,
+    rejecting_s: Array | None,
     distances: dict[str, _Distances],
 ) -> tuple[dict[str, Array], Array | None, Array | None, Array | None]:
-    """`gated`, `refused`, `recovered` and `inflation` of `GatingResult`."""
+    """`gated`, `rejecting_s`, `recovered` and `inflation` of `GatingResult`."""
     gated = {name: jnp.zeros_like(one.rows.mask) for name, one in linear.items()}
     with_gate = [n for n in linear if lowered.sensors[n].sensor.gate is not None]
     none = jnp.zeros(prior_cov.shape[-1], bool)
-    if refused is None:
+    if rejecting_s is None:
         return gated, None, None, None
     if not with_gate:
-        return gated, refused, none, None
+        return gated, rejecting_s, none, None
     ratios = {}
-    tally = _GateTally(none, none, jnp.zeros_like(refused), jnp.ones_like(refused))
+    tally = _GateTally(none, none, jnp.zeros_like(rejecting_s), jnp.ones_like(rejecting_s))
     for name in with_gate:
         own = (linear[name].rows.mask, distances[name], samples[name].dt)
         tally, gated[name], ratios[name] = _gate_sensor(lowered.sensors[name].sensor, tally, *own)
     accepted, rejected, rejected_s, excess = tally
-    after = jnp.where(accepted, 0.0, refused + rejected_s)
+    after = jnp.where(accepted, 0.0, rejecting_s + rejected_s)
     # Earlier samples must have filled the time: a single one is rejected whatever its period.
-    recovered = rejected & ~accepted & (refused > lowered.model.gate_reset_after_s)
+    recovered = rejected & ~accepted & (rejecting_s > lowered.model.gate_reset_after_s)
     for n in with_gate:
         reopened = ratios[n] < jnp.inf
         if isinstance(distances[n], _RepeatedDistances):
@@ -356,5 +356,5 @@ def _squared_distances(
 
 def _single_group(sensor: Sensor) -> Sensor:
     """One of the repeated groups of a sensor, as a sensor."""
-    assert sensor.alike is not None
-    return sensor.alike
+    assert sensor.single_group is not None
+    return sensor.single_group

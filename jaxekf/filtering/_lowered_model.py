@@ -144,7 +144,7 @@ class BoundModel:
         """
         sensor, function = self.lowered.sensors[name][:2]
         call = partial(self._call, f"sensor {name}", function, x, u)
-        if sensor.alike is None:
+        if sensor.single_group is None:
             return call(rows)
         # A scan over the groups: cotangents of their shared inputs are then summed one term at a time.
         groups = repeated_groups.split_groups(rows, sensor.copies)
@@ -239,8 +239,8 @@ def _lower_transition(
 def _lower_sensor(
     model: Model, sensor: Sensor, linearise: Linearisation, params: Any, x: Any, u: Any, rows: Any
 ) -> LoweredSensor:
-    single = sensor if sensor.alike is None else sensor.alike
-    if sensor.alike is not None:
+    single = sensor if sensor.single_group is None else sensor.single_group
+    if sensor.single_group is not None:
         rows = repeated_groups.single_group_spec(rows, sensor.copies)
     linearised = partial(linearise.sensor, model, single)
     (pattern,) = _find_patterns(lambda *args: [linearised(*args).jacobian], params, x, u, rows)

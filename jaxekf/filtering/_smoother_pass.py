@@ -55,7 +55,7 @@ class FilteredBeliefs(NamedTuple):
 
     prior: Belief
     updated: Belief
-    refused: Array | None
+    rejecting_s: Array | None
     """As in `FilterCarry`."""
 
 
@@ -65,8 +65,8 @@ class _SmootherInput(NamedTuple):
     substep: SubstepInput
     mean_before: Any
     """Filtered mean at the end of the substep before."""
-    refused_before: Array | None
-    """`FilterCarry.refused` at the end of the substep before."""
+    rejecting_before_s: Array | None
+    """`FilterCarry.rejecting_s` at the end of the substep before."""
     filtered: FilteredBeliefs
 
 
@@ -95,10 +95,10 @@ def smooth_backward(
     nothing = Information(jnp.zeros((size, lanes), dtype), jnp.zeros((size, size, lanes), dtype))
     start = initial_carry(lowered, *first)
     before = jax.tree.map(shift_by_one, start.belief.mean, filtered.updated.mean)
-    refused = None
-    if start.refused is not None and filtered.refused is not None:
-        refused = shift_by_one(start.refused, filtered.refused)
-    own = _SmootherInput(inputs.substeps, before, refused, filtered)
+    rejecting_s = None
+    if start.rejecting_s is not None and filtered.rejecting_s is not None:
+        rejecting_s = shift_by_one(start.rejecting_s, filtered.rejecting_s)
+    own = _SmootherInput(inputs.substeps, before, rejecting_s, filtered)
     epoch = partial(_epoch, bound)
     info, found = lax.scan(epoch, nothing, (own, inputs.fast, inputs.slow), reverse=True)
     return found, smoothed(bound, first.belief, info)
@@ -164,7 +164,7 @@ def _information_before_update(
     if not samples:
         return info
     prior = own.filtered.prior
-    predicted = FilterCarry(prior, own.refused_before)
+    predicted = FilterCarry(prior, own.rejecting_before_s)
     result, cov = linearise_and_gate(bound, predicted, own.substep.u, samples)
     linear = result.linear
     accumulator = UpdateAccumulator(cov, jnp.zeros_like(cov[0]), jnp.zeros_like(cov[0, 0]))

@@ -39,7 +39,7 @@ class FilterCarry(NamedTuple):
     """The carry of the scan over substeps."""
 
     belief: Belief
-    refused: Array | None
+    rejecting_s: Array | None
     """(lanes,) seconds of samples that gates have rejected since they last accepted one; None without
     gates."""
 
@@ -63,13 +63,13 @@ class StepOutput(NamedTuple):
     """(lanes,) where the gates were reset and the belief widened; None without gates."""
 
 
-def initial_carry(lowered: LoweredModel, belief: Belief, refused: Array | None) -> FilterCarry:
-    """The carry at the start of a run; `refused` (lanes,) as in `FilterCarry`, None for 0."""
+def initial_carry(lowered: LoweredModel, belief: Belief, rejecting_s: Array | None) -> FilterCarry:
+    """The carry at the start of a run; `rejecting_s` (lanes,) as in `FilterCarry`, None for 0."""
     if not lowered.is_gated:
         return FilterCarry(belief, None)
-    if refused is None:
-        refused = jnp.zeros(belief.cov.shape[-1], belief.cov.dtype)
-    return FilterCarry(belief, refused)
+    if rejecting_s is None:
+        rejecting_s = jnp.zeros(belief.cov.shape[-1], belief.cov.dtype)
+    return FilterCarry(belief, rejecting_s)
 
 
 def predict(bound: BoundModel, belief: Belief, inputs: SubstepInput) -> Belief:
@@ -96,7 +96,7 @@ def update(
     lanes, dtype = prior.cov.shape[-1], prior.cov.dtype
     if not linear:
         zero, valid = jnp.zeros(lanes, dtype), _has_valid_variances(prior.cov)
-        never = None if predicted.refused is None else jnp.zeros(lanes, bool)
+        never = None if predicted.rejecting_s is None else jnp.zeros(lanes, bool)
         return StepOutput(prior, predicted, zero, valid, used, gated, never)
     accumulator = UpdateAccumulator(cov, jnp.zeros(cov.shape[1:], dtype), jnp.zeros(lanes, dtype))
     smallest = jnp.ones(lanes, dtype)
@@ -111,7 +111,7 @@ def update(
         )
         smallest = jnp.minimum(smallest, pivot)
     healthy = (smallest > 0.0) & _has_valid_variances(posterior.cov)
-    carry = FilterCarry(posterior, result.refused)
+    carry = FilterCarry(posterior, result.rejecting_s)
     log_likelihood = accumulator.log_likelihood
     return StepOutput(prior, carry, log_likelihood, healthy, used, gated, result.recovered)
 
@@ -123,7 +123,9 @@ def linearise_and_gate(
     inflated where the gates were reset."""
     prior = predicted.belief
     linear = linearise(bound, prior.mean, u, samples)
-    result = gating.gate_and_weight(bound.lowered, linear, samples, prior.cov, predicted.refused)
+    result = gating.gate_and_weight(
+        bound.lowered, linear, samples, prior.cov, predicted.rejecting_s
+    )
     cov = prior.cov if result.inflation is None else prior.cov * result.inflation[None, None]
     return result, cov
 

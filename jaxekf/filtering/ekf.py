@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf._support.deprecations import renamed_arguments, warn_renamed
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering import _gating as gating
 from jaxekf.filtering import _lowered_model as lowered_model
@@ -80,8 +81,14 @@ class Instant(NamedTuple):
     recovered: Array | None
     """True where the gates were reset and the belief was widened (see `Model.gate_reset_after_s`); None
     without gates, or if not kept."""
-    refused: Array | None
+    rejecting_s: Array | None
     """Seconds of samples that gates have rejected since they last accepted one; None likewise."""
+
+    @property
+    def refused(self) -> Array | None:
+        """Deprecated name of `rejecting_s`."""
+        warn_renamed("the field refused of Instant", "rejecting_s")
+        return self.rejecting_s
 
 
 class FilterOutput(NamedTuple):
@@ -112,6 +119,7 @@ def initial_belief(model: Model, params: Parameters, first: Mapping[str, Any]) -
     return Belief(model.initial_mean(first), model.initial_covariance(params))
 
 
+@renamed_arguments(refused="rejecting_s")
 def run_filter(
     model: Model,
     params: Parameters,
@@ -121,7 +129,7 @@ def run_filter(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
-    refused: Array | None = None,
+    rejecting_s: Array | None = None,
     relinearise: int = 0,
 ) -> FilterOutput:
     """Filter one run from an initial belief; differentiable in everything, and fast under `vmap`.
@@ -138,8 +146,8 @@ def run_filter(
         adjoint has no forward mode (forward over reverse is fine). False takes JAX's own derivatives.
     checkpoint
         Whether the reverse pass keeps a few beliefs and computes the others again. False keeps all.
-    refused
-        `Instant.refused` at the end of an earlier part of the run.
+    rejecting_s
+        `Instant.rejecting_s` at the end of an earlier part of the run.
     relinearise
         Number of further linearisations of every update, each about the result of the one before, with the
         prediction's covariance as the prior (iterated extended Kalman filter). Gates, weights, innovations
@@ -165,12 +173,13 @@ def run_filter(
     >>> bool(run(model.parameters).instants.healthy.all())
     True
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, refused))
-    options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "refused": one[3]}
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, rejecting_s))
+    options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "rejecting_s": one[3]}
     options |= {"relinearise": relinearise}
     return jax.tree.map(lambda a: a[0], run_filter_batch(model, *one[:3], **options))
 
 
+@renamed_arguments(refused="rejecting_s")
 def run_filter_batch(
     model: Model,
     params: Parameters,
@@ -180,7 +189,7 @@ def run_filter_batch(
     keep: Keep = "everything",
     adjoint: bool = True,
     checkpoint: bool = True,
-    refused: Array | None = None,
+    rejecting_s: Array | None = None,
     relinearise: int = 0,
     devices: Sequence[Any] = (),
 ) -> FilterOutput:
@@ -190,7 +199,7 @@ def run_filter_batch(
 
     Parameters
     ----------
-    model, params, belief, steps, keep, adjoint, checkpoint, refused, relinearise
+    model, params, belief, steps, keep, adjoint, checkpoint, rejecting_s, relinearise
         As in `run_filter`.
     devices
         Devices that share the runs. CPU cores are devices if JAX's `jax_num_cpu_devices` was set before its
@@ -212,7 +221,7 @@ def run_filter_batch(
     params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
     lowered, prepared, inputs = lower_model(model, params, belief, steps, relinearise)
     u = inputs.substeps.u
-    save, first = _SAVE_SPECS[keep], ScanInit(belief, refused)
+    save, first = _SAVE_SPECS[keep], ScanInit(belief, rejecting_s)
     if adjoint:
         runs, epochs, substeps = steps.dt.shape
         belief_bytes = sum(a.size * a.dtype.itemsize for a in jax.tree.leaves(belief)) // runs
@@ -228,7 +237,7 @@ def run_filter_batch(
         )
     updated: Any = Updated(kept.mean, kept.cov) if kept.cov is None else Belief(kept.mean, kept.cov)
     instants = Instant(
-        kept.prior, updated, kept.log_likelihood, kept.healthy, kept.recovered, kept.refused
+        kept.prior, updated, kept.log_likelihood, kept.healthy, kept.recovered, kept.rejecting_s
     )
     innovations = _innovations(model, params, u, steps, kept) if save.used else {}
     return FilterOutput(instants, u, innovations)

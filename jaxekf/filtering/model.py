@@ -63,6 +63,7 @@ class Belief(NamedTuple):
     cov: Array
 
 
+@renamed_fields(aux_like="typical_aux", alike="single_group")
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """One kind of measurement.
@@ -87,15 +88,15 @@ class Sensor:
     weighting: Literal["huber", "student"] | None = None
     """Robust weighting (Huber or Student-t): the noise of a group grows with its innovation, and the
     likelihood is that of the inflated noise. None for none."""
-    aux_like: Any = None
+    typical_aux: Any = None
     """Typical auxiliary data, used for samples that come without; None if `predict` needs none."""
-    alike: "Sensor | None" = None
+    single_group: "Sensor | None" = None
     """One group as a sensor, if the sample consists of many equal groups; see `repeated`."""
 
     @property
     def copies(self) -> int:
         """Number of equal groups that a sample consists of; 1 for a sensor that is not `repeated`."""
-        return 1 if self.alike is None else self.rows // self.alike.rows
+        return 1 if self.single_group is None else self.rows // self.single_group.rows
 
     @property
     def rows(self) -> int:
@@ -133,7 +134,7 @@ def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
     ModelError
         For another space, for no group, or if the number of labels is not the number of rows.
     """
-    if not isinstance(one.space, manifold.Euclidean) or one.alike is not None or count < 1:
+    if not isinstance(one.space, manifold.Euclidean) or one.single_group is not None or count < 1:
         raise ModelError(
             f"sensor '{one.name}': got {count} groups in {type(one.space).__name__}, expected one or more"
             " in Euclidean; give one group whose sample is a vector"
@@ -152,11 +153,17 @@ def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
         here = jnp.eye(count, dtype=each.dtype)[:, None, :, None]
         return (here * each[:, :, None, :]).reshape(count * rows, count * rows)
 
-    like = jax.tree.map(lambda a: np.repeat(np.asarray(a)[None], count, axis=0), one.aux_like)
+    like = jax.tree.map(lambda a: np.repeat(np.asarray(a)[None], count, axis=0), one.typical_aux)
     space = replace(one.space, size=count * rows, labels=tuple(labels))
     groups = tuple(np.repeat(np.arange(count), rows).tolist())
     return replace(
-        one, space=space, predict=predict, noise=noise, groups=groups, aux_like=like, alike=one
+        one,
+        space=space,
+        predict=predict,
+        noise=noise,
+        groups=groups,
+        typical_aux=like,
+        single_group=one,
     )
 
 

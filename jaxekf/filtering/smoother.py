@@ -106,7 +106,7 @@ def run_smoother_batch(
     )
     lowered, prepared, inputs = ekf.lower_model(model, params, belief, steps)
     at: Any = filtered.instants
-    beliefs = FilteredBeliefs(at.predicted, at.updated, at.refused)
+    beliefs = FilteredBeliefs(at.predicted, at.updated, at.rejecting_s)
     trees = (prepared, ScanInit(belief), inputs, beliefs)
     if adjoint:
         smoothed, start = _smooth_with_vjp(lowered, tuple(devices))(*reverse_only(trees))

@@ -171,7 +171,9 @@ MODEL = Model(
     space=inertial.SPACE,
     transition=inertial.transition,
     process_noise=inertial.process_noise,
-    sensors=(Sensor("optical", SPACE, predict_pose, pose_noise, _source, gate=GATE, aux_like=0.0),),
+    sensors=(
+        Sensor("optical", SPACE, predict_pose, pose_noise, _source, gate=GATE, typical_aux=0.0),
+    ),
     parameters=DEFAULTS,
     units=UNITS,
     noise_dims=Noise(3, 3, 3, 3, 3, 3),

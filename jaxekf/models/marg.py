@@ -287,7 +287,7 @@ MODEL = Model(
             predict_magnetometer,
             magnetometer_noise,
             magnetometer,
-            aux_like=np.zeros(2),
+            typical_aux=np.zeros(2),
         ),
         Sensor(
             "velocity",

@@ -71,8 +71,8 @@ def _robust(model: Model, outlier_method: OutlierMethod, probability: float) -> 
 
 
 def _changed(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
-    alike = None if sensor.alike is None else replace(sensor.alike, **changes)
-    return replace(sensor, alike=alike, **changes)
+    single_group = None if sensor.single_group is None else replace(sensor.single_group, **changes)
+    return replace(sensor, single_group=single_group, **changes)
 
 
 def _adapted(

@@ -148,7 +148,9 @@ def _sensor(index: int, name: str) -> Sensor:
     predict: Callable[..., Any] = partial(_predict, index)
     source = partial(_source, name)
     space = Euclidean(3, "m", frame="reference")
-    return Sensor(sensor_name(name), space, predict, marker_noise, source, gate=GATE, aux_like=0.0)
+    return Sensor(
+        sensor_name(name), space, predict, marker_noise, source, gate=GATE, typical_aux=0.0
+    )
 
 
 L_SHAPE = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])

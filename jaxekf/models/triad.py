@@ -154,7 +154,9 @@ MODEL = Model(
             predict_attitude,
             attitude_noise,
             attitude,
-            aux_like=Readings(np.array([0.0, 0.0, STANDARD_GRAVITY]), np.array([0.0, 0.5, -0.866])),
+            typical_aux=Readings(
+                np.array([0.0, 0.0, STANDARD_GRAVITY]), np.array([0.0, 0.5, -0.866])
+            ),
         ),
     ),
     parameters=DEFAULTS,

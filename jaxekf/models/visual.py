@@ -331,7 +331,7 @@ def _point(count: int, bilinear: bool) -> Sensor:
         bilinear_noise if bilinear else point_noise,
         partial(correspondences.camera, count, bilinear),
         gate=GATE,
-        aux_like=like,
+        typical_aux=like,
     )
 
 

@@ -37,6 +37,12 @@ class Noise(NamedTuple):
     optical: Any
 
 
+class Calibration(NamedTuple):
+    """Offset of the gyroscope's clock from the tracker's, seconds."""
+
+    clock_offset: Any
+
+
 class Initial(NamedTuple):
     """Standard deviations at the start."""
 
@@ -94,19 +100,23 @@ MODEL = Model(
     ),
     parameters=Parameters(
         Noise(np.deg2rad(0.05), np.deg2rad(0.005), 1e-4, np.deg2rad(0.3)),
-        calibration=(),
+        calibration=Calibration(0.0),
         initial=Initial(np.deg2rad(10.0), np.deg2rad(1.0), 0.02),
     ),
     units=Parameters(
         Noise("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "1/sqrt(s)", "rad"),
-        calibration=(),
+        calibration=Calibration("s"),
         initial=Initial("rad", "rad/s", "1"),
     ),
     noise_dims=Noise(3, 3, 3, 3),
     initial_mean=initial_mean,
     initial_covariance=initial_covariance,
     start_with=("optical",),
-    input=Input("gyroscope", sources.gyroscope),
+    input=Input(
+        "gyroscope",
+        sources.gyroscope,
+        clock_offset=lambda params: params.calibration.clock_offset,
+    ),
     outputs=(
         Output("attitude", SO3(), "body", lambda x, u, params: x.q_ref_body),
         Output(

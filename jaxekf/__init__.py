@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from jaxekf.io.run_folder import load, save
     from jaxekf.models import get_model
     from jaxekf.models.robust import robust
-    from jaxekf.recordings.gaps import split_at_gaps
+    from jaxekf.recordings.gaps import crop, split_at_gaps
     from jaxekf.recordings.types import Camera, Encoder, Imu, Markers, Optical, Recording, Samples
     from jaxekf.simulation import demo
 
@@ -105,6 +105,7 @@ __all__ = [
     "TuningError",
     "Verdict",
     "Whiteness",
+    "crop",
     "demo",
     "diagnose",
     "diagnose_many",

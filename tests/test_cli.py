@@ -50,6 +50,24 @@ def test_simulate_writes_runs(runs):
     assert t[-1] == pytest.approx(4.0, abs=0.02)
 
 
+def test_crop_makes_two_runs_of_one(runs, tmp_path):
+    """Would catch a sample that is in both parts or in none, times that begin anew, or a lost mask."""
+    for span, name in ((("--to", 1.5), "first"), (("--from", 1.5), "second")):
+        result = call("crop", runs[0], *span, "-o", tmp_path / name, "--json")
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["samples"].keys() == {"optical", "imu", "encoder"}
+    whole, *parts = [jaxekf.load(p) for p in (runs[0], tmp_path / "first", tmp_path / "second")]
+    for label, stream in whole.streams.items():
+        for key, value in stream.arrays.items():
+            joined = [part.streams[label].arrays[key] for part in parts]
+            np.testing.assert_array_equal(np.concatenate(joined), value, f"{label}.{key}")
+    imu = parts[1].need_imu().time_ns[0] - whole.need_imu().time_ns[0]
+    assert 0 <= imu - 1_500_000_000 < 8_000_000
+    outside = call("crop", runs[0], "--from", 4.5, "-o", tmp_path / "none")
+    assert outside.exit_code == 1 and "expected an interval within 0 to 4.000 s" in outside.output
+    assert not (tmp_path / "none").exists()
+
+
 def test_estimate_writes_results(runs, tmp_path):
     """Would catch JSON mixed with other text, or a result that is not where it is said to be."""
     result = call("estimate", *runs, "-o", tmp_path / "out", "--json")

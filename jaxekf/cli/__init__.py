@@ -1,4 +1,4 @@
-"""The command line: simulate, import, check, allan, align, estimate, tune, plot, report, demo.
+"""The command line: simulate, import, check, crop, allan, align, estimate, tune, plot, report, demo.
 
 Each command is a module here, imported only when the command runs. A new command is a module with its line
 in `_SUMMARIES`.
@@ -13,6 +13,7 @@ _SUMMARIES = {
     "align": "Clock offset and rotation between tracker and IMU.",
     "allan": "Noise densities of an IMU from a static recording.",
     "check": "Check of samples, gaps, clocks, frames and units.",
+    "crop": "A part of a run, as a run of its own.",
     "demo": "Tuning and estimates of the bundled recordings.",
     "estimate": "Attitude, rate, biases and pose of runs.",
     "import": "Recordings of other programs, converted to runs.",

@@ -1,4 +1,4 @@
-"""A run cut where its IMU has a gap: over it the motion is not known, and nothing is interpolated."""
+"""Parts of a run: between two times, and between the gaps of its IMU, where the motion is not known."""
 
 import itertools
 from collections.abc import Mapping
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf._support.errors import RecordingError
 from jaxekf.recordings.accounts import Intake, Part, Reason
 from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times, period_ns
 
@@ -19,6 +20,52 @@ _SHORTEST_S = 0.5
 def longest_ns(time_ns: Times) -> float:
     """The longest step between samples of an input that is bridged, ns."""
     return max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * period_ns(time_ns))
+
+
+def crop(recording: Recording, start_s: float = 0.0, end_s: float = np.inf) -> Recording:
+    """The part of a run between two times, for example to hold out its end from a tuning.
+
+    Parameters
+    ----------
+    recording
+        The run.
+    start_s, end_s
+        Seconds from the IMU's first sample. Samples taken at `start_s` belong to the part, those taken at
+        `end_s` do not.
+
+    Returns
+    -------
+    Recording
+        The part, with the account of its rows, the name ``NAME-part`` and its times in ``info["part"]``.
+
+    Raises
+    ------
+    RecordingError
+        If the IMU has no sample in the interval.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> training, validation = jaxekf.crop(run, 0.0, 16.0), jaxekf.crop(run, 16.0)
+    >>> [len(part.need_imu().time_ns) for part in (run, training, validation)]
+    [3001, 2000, 1001]
+    """
+    time = recording.need_imu().time_ns
+    length_s = float(time[-1] - time[0]) / NANOSECONDS
+    last = np.iinfo(np.int64).max
+    begin = int(time[0]) + round(max(start_s, 0.0) * NANOSECONDS) if start_s <= length_s else last
+    end = int(time[0]) + round(end_s * NANOSECONDS) if end_s <= length_s else last
+    if not ((time >= begin) & (time < end)).any():
+        raise RecordingError(
+            recording.path or recording.name,
+            f"no sample of the IMU from {start_s:g} s to {end_s:g} s",
+            f"an interval within 0 to {length_s:.3f} s",
+            "other times",
+        )
+    part = _part(recording, begin, end)
+    about = f"{start_s:g} s to {min(end_s, length_s):g} s of '{recording.name}'"
+    return part.replace(name=f"{recording.name}-part", info={**recording.info, "part": about})
 
 
 def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording]]:

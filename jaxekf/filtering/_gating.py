@@ -12,10 +12,12 @@ import numpy as np
 from jax import Array, lax
 
 from jaxekf._support import chi_square
+from jaxekf.filtering import _belief_reset as belief_reset
 from jaxekf.filtering import _covariance_update as covariance_update
 from jaxekf.filtering import _repeated_groups as repeated_groups
+from jaxekf.filtering._belief_reset import Resets, ResetTally
 from jaxekf.filtering._covariance_update import MeasurementRows
-from jaxekf.filtering._lowered_model import LoweredModel
+from jaxekf.filtering._lowered_model import BoundModel
 from jaxekf.filtering.lowering.lanes import unrolled_sum
 from jaxekf.filtering.lowering.structured_matrix import Pattern
 from jaxekf.filtering.model import Sensor
@@ -26,6 +28,8 @@ _HUBER_PROBABILITY = 0.95
 """Probability with which a Gaussian group keeps its full weight under Huber's law."""
 _STUDENT_DOF = 4.0
 """Degrees of freedom of Student's t: heavy tails, finite variance."""
+_PLAUSIBLE = 0.999
+"""Without a gate: probability with which a Gaussian group agrees with the belief (see `_belief_reset`)."""
 _REOPENED_RATIO = 7.0
 """After a gate reset, groups of a repeated sensor are accepted up to this multiple of the mean normalised
 squared error. One Gaussian group in a thousand exceeds it."""
@@ -46,12 +50,8 @@ class GatingResult(NamedTuple):
     """By sensor: gated rows hidden, noise of down-weighted rows inflated."""
     gated: dict[str, Array]
     """By sensor: (rows, lanes) visible rows that a gate rejected."""
-    rejecting_s: Array | None
-    """(lanes,) as in `FilterCarry`; None without gates, as the next two."""
-    recovered: Array | None
-    """(lanes,) where the gates were reset."""
-    inflation: Array | None
-    """(lanes,) factor on the predicted covariance: above 1 where the gates were reset."""
+    resets: Resets | None
+    """None if the model is never reset."""
 
 
 class _GroupDistance(NamedTuple):
@@ -76,22 +76,20 @@ _Distances = list[_GroupDistance] | _RepeatedDistances
 
 
 def gate_and_weight(
-    lowered: LoweredModel,
+    bound: BoundModel,
     linear: dict[str, LinearisedRows],
     samples: dict[str, Rows],
     prior_cov: Array,
     rejecting_s: Array | None,
 ) -> GatingResult:
-    """Reject rows by gates, inflate the noise of others by weights, and reset gates that reject everything.
+    """Reject rows by gates, inflate the noise of others by weights, and reset a belief that none agrees with.
 
-    Where gates have accepted nothing and rejected samples for longer than `Model.gate_reset_after_s`, the
-    belief is taken to be wrong: the gates open once, and the predicted covariance is multiplied by the
-    ratio of squared error to expected squared error. All samples then have full weight.
+    At a reset (`jaxekf.filtering._belief_reset`) gates are open and all samples have full weight.
 
     Parameters
     ----------
-    lowered
-        The model.
+    bound
+        The model with its parameters.
     linear
         The sensors of this instant, linearised at the prediction.
     samples
@@ -99,26 +97,45 @@ def gate_and_weight(
     prior_cov
         Predicted covariance, (n, n, lanes).
     rejecting_s
-        (lanes,) as in `FilterCarry`.
+        (groups, lanes) as in `FilterCarry`; None if the model is never reset.
     """
+    lowered = bound.lowered
     sensors = {name: lowered.sensors[name].sensor for name in linear}
-    distances = {
-        name: _innovation_distances(sensors[name], one, prior_cov)
-        for name, one in linear.items()
-        if sensors[name].gate is not None or sensors[name].weighting is not None
-    }
-    gated, after, recovered, inflation = _apply_gates(
-        lowered, linear, samples, prior_cov, rejecting_s, distances
-    )
+    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in linear.items()}
+    distances: dict[str, _Distances] = {}
+    ratios: dict[str, Array] = {}
+    tallies: dict[str, ResetTally] = {}
+    for name, one in linear.items():
+        sensor = sensors[name]
+        if rejecting_s is None and sensor.gate is None and sensor.weighting is None:
+            continue
+        distances[name] = _innovation_distances(sensor, one, prior_cov)
+        outside, ratios[name], tallies[name] = _compare_with_bounds(
+            sensor, one.rows.mask, distances[name], samples[name].dt
+        )
+        if sensor.gate is not None:
+            gated[name] = outside
+    resets = None
+    if rejecting_s is not None:
+        resets = belief_reset.reset(
+            lowered.reset_groups,
+            tallies,
+            rejecting_s,
+            lowered.model.gate_reset_after_s,
+            prior_cov,
+            bound.prepared["initial variance"],
+        )
+        for name, here in resets.recovered.items():
+            gated[name] &= ~_reopened(ratios[name], tallies[name].excess, here, distances[name])
     kept = {name: _hide_rows(one, gated[name]) for name, one in linear.items()}
-    for name in distances:
+    for name, distance in distances.items():
         if sensors[name].weighting is None:
             continue
-        factor = _row_inflation(sensors[name], distances[name], kept[name].rows.mask.shape[-2])
-        if recovered is not None:
-            factor = jnp.where(recovered, 1.0, factor)
+        factor = _row_inflation(sensors[name], distance, kept[name].rows.mask.shape[-2])
+        if resets is not None:
+            factor = jnp.where(resets.recovered[name], 1.0, factor)
         kept[name] = _inflate_noise(kept[name], factor)
-    return GatingResult(kept, gated, after, recovered, inflation)
+    return GatingResult(kept, gated, resets)
 
 
 # --- weights ------------------------------------------------------------------------------------------
@@ -187,75 +204,38 @@ def _hide_rows(linear: LinearisedRows, gated: Array) -> LinearisedRows:
     return linear._replace(rows=linear.rows._replace(mask=linear.rows.mask & ~gated))
 
 
-def _apply_gates(
-    lowered: LoweredModel,
-    linear: dict[str, LinearisedRows],
-    samples: dict[str, Rows],
-    prior_cov: Array,
-    rejecting_s: Array | None,
-    distances: dict[str, _Distances],
-) -> tuple[dict[str, Array], Array | None, Array | None, Array | None]:
-    """`gated`, `rejecting_s`, `recovered` and `inflation` of `GatingResult`."""
-    gated = {name: jnp.zeros_like(one.rows.mask) for name, one in linear.items()}
-    with_gate = [n for n in linear if lowered.sensors[n].sensor.gate is not None]
-    none = jnp.zeros(prior_cov.shape[-1], bool)
-    if rejecting_s is None:
-        return gated, None, None, None
-    if not with_gate:
-        return gated, rejecting_s, none, None
-    ratios = {}
-    tally = _GateTally(none, none, jnp.zeros_like(rejecting_s), jnp.ones_like(rejecting_s))
-    for name in with_gate:
-        own = (linear[name].rows.mask, distances[name], samples[name].dt)
-        tally, gated[name], ratios[name] = _gate_sensor(lowered.sensors[name].sensor, tally, *own)
-    accepted, rejected, rejected_s, excess = tally
-    after = jnp.where(accepted, 0.0, rejecting_s + rejected_s)
-    # Earlier samples must have filled the time: a single one is rejected whatever its period.
-    recovered = rejected & ~accepted & (rejecting_s > lowered.model.gate_reset_after_s)
-    for n in with_gate:
-        reopened = ratios[n] < jnp.inf
-        if isinstance(distances[n], _RepeatedDistances):
-            # Most points of an image are good and the others far off, also from a belief so widened.
-            reopened &= ratios[n] <= _REOPENED_RATIO * jnp.broadcast_to(excess, reopened.shape)
-        gated[n] &= ~(reopened & jnp.broadcast_to(recovered, reopened.shape))
-    inflation = lax.stop_gradient(jnp.where(recovered, excess, 1.0))
-    return gated, jnp.where(recovered, 0.0, after), recovered, inflation
-
-
-class _GateTally(NamedTuple):
-    """Summary of the gates of all sensors at one instant, each (lanes,)."""
-
-    accepted: Array
-    rejected: Array
-    rejected_s: Array
-    """The longest sampling period of the rejected samples."""
-    excess: Array
-    """The largest ratio of squared error to expected squared error among rejected groups; for repeated
-    groups their geometric mean, in which a few that are far off count little."""
-
-
-def _gate_sensor(
-    sensor: Sensor, tally: _GateTally, mask: Array, distances: _Distances, dt: Array
-) -> tuple[_GateTally, Array, Array]:
-    """The tally with one more sensor, its rejected rows, and for each row its group's ratio of squared
-    error to expected squared error."""
+def _reopened(ratio: Array, excess: Array, recovered: Array, distances: _Distances) -> Array:
+    """Rows whose gate a reset opens: all but those that are not finite."""
+    reopened = ratio < jnp.inf
     if isinstance(distances, _RepeatedDistances):
-        return _gate_repeated_sensor(_single_group(sensor), tally, mask, distances, dt)
-    accepted, rejected, rejected_s, excess = tally
-    gated, ratio = _gate_rows(sensor, mask, distances)
-    finite = gated & (jnp.stack(ratio) < jnp.inf)
+        # Most points of an image are good and the others far off, also from a belief so widened.
+        reopened &= ratio <= _REOPENED_RATIO * jnp.broadcast_to(excess, reopened.shape)
+    return reopened & jnp.broadcast_to(recovered, reopened.shape)
+
+
+def _compare_with_bounds(
+    sensor: Sensor, mask: Array, distances: _Distances, dt: Array
+) -> tuple[Array, Array, ResetTally]:
+    """Visible rows outside their chi-square bound; for each row its group's ratio of squared error to
+    expected squared error; and the tally of the sensor."""
+    if isinstance(distances, _RepeatedDistances):
+        return _compare_repeated(_single_group(sensor), mask, distances, dt)
+    outside, ratio = _rows_outside(sensor, mask, distances)
+    accepted = rejected = jnp.zeros(mask.shape[-1], bool)
+    excess = jnp.ones_like(ratio[0])
     for row in range(mask.shape[0]):
-        accepted = accepted | (mask[row] & ~gated[row])
-        rejected = rejected | finite[row]
-        excess = jnp.where(finite[row], jnp.maximum(excess, ratio[row]), excess)
-        rejected_s = jnp.where(finite[row], jnp.maximum(rejected_s, dt), rejected_s)
-    return _GateTally(accepted, rejected, rejected_s, excess), gated, jnp.stack(ratio)
+        finite = outside[row] & (ratio[row] < jnp.inf)
+        accepted = accepted | (mask[row] & ~outside[row])
+        rejected = rejected | finite
+        excess = jnp.where(finite, jnp.maximum(excess, ratio[row]), excess)
+    tally = ResetTally(accepted, rejected, jnp.where(rejected, dt, 0.0), excess)
+    return outside, jnp.stack(ratio), tally
 
 
-def _gate_repeated_sensor(
-    single: Sensor, tally: _GateTally, mask: Array, distances: _RepeatedDistances, dt: Array
-) -> tuple[_GateTally, Array, Array]:
-    """`_gate_sensor` of a sensor with repeated groups, `single` being one of them as a sensor.
+def _compare_repeated(
+    single: Sensor, mask: Array, distances: _RepeatedDistances, dt: Array
+) -> tuple[Array, Array, ResetTally]:
+    """`_compare_with_bounds` of a sensor with repeated groups, `single` being one of them as a sensor.
 
     The sensor counts as accepted if most of its visible groups were: a few points fit by chance.
     """
@@ -265,32 +245,24 @@ def _gate_repeated_sensor(
     def one(carry: tuple[Array, Array, Array, Array], at: Any) -> tuple[Any, Any]:
         balance, rejected, number, logs = carry
         mask, each = at
-        gated, ratio = _gate_rows(single, mask, [_GroupDistance(rows, *each)])
-        group_gated, visible = gated[0], mask[0]
+        outside, ratio = _rows_outside(single, mask, [_GroupDistance(rows, *each)])
+        group_outside, visible = outside[0], mask[0]
         for row in rows[1:]:
-            group_gated, visible = group_gated | gated[row], visible | mask[row]
-        finite = group_gated & (ratio[0] < jnp.inf)
-        balance = balance + jnp.where(group_gated, -1.0, jnp.where(visible, 1.0, 0.0))
+            group_outside, visible = group_outside | outside[row], visible | mask[row]
+        finite = group_outside & (ratio[0] < jnp.inf)
+        balance = balance + jnp.where(group_outside, -1.0, jnp.where(visible, 1.0, 0.0))
         log = jnp.log(jnp.where(finite, jnp.maximum(ratio[0], 1.0), 1.0))
         carry = (balance, rejected | finite, number + finite.astype(dt.dtype), logs + log)
-        return carry, (gated, jnp.stack(ratio))
+        return carry, (outside, jnp.stack(ratio))
 
     begin = (zero, jnp.zeros(dt.shape, bool), zero, zero)
-    (balance, rejected, number, logs), (gated, ratio) = lax.scan(one, begin, (mask, distances))
-    larger = jnp.maximum(tally.excess, jnp.exp(logs / jnp.maximum(number, 1.0)))
-    return (
-        _GateTally(
-            tally.accepted | (balance > 0.0),
-            tally.rejected | rejected,
-            jnp.where(rejected, jnp.maximum(tally.rejected_s, dt), tally.rejected_s),
-            jnp.where(rejected, larger, tally.excess),
-        ),
-        gated,
-        lax.stop_gradient(ratio),
-    )
+    (balance, rejected, number, logs), (outside, ratio) = lax.scan(one, begin, (mask, distances))
+    excess = jnp.where(rejected, jnp.exp(logs / jnp.maximum(number, 1.0)), 1.0)
+    tally = ResetTally(balance > 0.0, rejected, jnp.where(rejected, dt, 0.0), excess)
+    return outside, lax.stop_gradient(ratio), tally
 
 
-def _gate_rows(
+def _rows_outside(
     sensor: Sensor, mask: Array, groups: list[_GroupDistance]
 ) -> tuple[Array, list[Array]]:
     """Visible rows (m, lanes) whose group is outside its chi-square bound, and for each row its group's
@@ -298,7 +270,7 @@ def _gate_rows(
     outside: list[Any] = [None] * sensor.rows
     ratios: list[Any] = [None] * sensor.rows
     for members, visible, distance in groups:
-        bound = _chi_square_bound(sensor.gate, members, visible, distance)
+        bound = _chi_square_bound(sensor.gate or _PLAUSIBLE, members, visible, distance)
         # A distance that is NaN is outside too: such a row must not enter the update.
         rejected = jnp.logical_not(distance <= bound)
         ratio = distance / jnp.maximum(visible, 1).astype(distance.dtype)

@@ -12,7 +12,7 @@ path (`ABOUT_PATH`), and need the derivatives of the residuals themselves.
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +23,7 @@ from jax import Array, lax
 from jaxekf._support.errors import SlowModelWarning
 from jaxekf.filtering import _linearisation as linearisation
 from jaxekf.filtering import _repeated_groups as repeated_groups
+from jaxekf.filtering._belief_reset import ResetGroup, find_groups
 from jaxekf.filtering._linearisation import Jacobian
 from jaxekf.filtering.lowering import scalar_graph, sparsity, structured_matrix
 from jaxekf.filtering.lowering.lowered_function import LoweredFunction
@@ -100,6 +101,9 @@ class LoweredModel:
         found: dict[str, Any] = {name: f.prepare(params) for name, f in functions.items()}
         if self.iterated_update is not None:
             found["iterated update"] = self.iterated_update.lowered.prepare(params)
+        if self.reset_groups:
+            cov = self.model.initial_covariance(params)
+            found["initial variance"] = lax.stop_gradient(jnp.diagonal(cov))
         return found
 
     def bind(self, prepared: dict[str, Any], *, adjoint: bool) -> "BoundModel":
@@ -110,10 +114,14 @@ class LoweredModel:
         """
         return BoundModel(self, prepared, adjoint)
 
-    @property
-    def is_gated(self) -> bool:
-        """Whether any sensor has a gate."""
-        return any(lowered.sensor.gate is not None for lowered in self.sensors.values())
+    @cached_property
+    def reset_groups(self) -> tuple[ResetGroup, ...]:
+        """Groups of sensors that can contradict the belief; empty if the model is never reset."""
+        if not self.model.gate_reset_after_s < np.inf:
+            return ()
+        patterns = {name: lowered.pattern for name, lowered in self.sensors.items()}
+        gated = {n: lowered.sensor.gate is not None for n, lowered in self.sensors.items()}
+        return find_groups(patterns, gated)
 
 
 @dataclass(frozen=True, eq=False)

@@ -262,10 +262,10 @@ def _with_adjoint(
         perturbed = _PerturbedLeaves(_perturbed(prepared), _perturbed(inputs))
         values = jax.tree.map(lambda leaf: leaf.value, (prepared, first, inputs))
         outputs, starts = forward_saving(None, *values)
-        return outputs, (values[0], starts, values[2], perturbed, first.rejecting_s is None)
+        return outputs, (values[0], starts, values[2], perturbed, values[1].rejecting_s)
 
     def backward(saved: Any, cotangents: Any) -> Any:
-        prepared, starts, inputs, perturbed, at_rest = saved
+        prepared, starts, inputs, perturbed, rejecting_s = saved
         cotangents = _symmetrise_cotangents(cotangents)
         leaves = jax.tree.leaves(cotangents, is_leaf=lambda c: isinstance(c, SymbolicZero))
         live = tuple(
@@ -275,7 +275,7 @@ def _with_adjoint(
         back = _adjoint_of_runs(lowered, save, segment, devices, perturbed, live)
         total, first, of_inputs = back(starts, prepared, inputs, chosen)[0]
         # The times of rejected samples decide which samples are accepted, but have no derivative.
-        rejecting_s = None if at_rest else jnp.zeros(first.cov.shape[0], first.cov.dtype)
+        rejecting_s = None if rejecting_s is None else jnp.zeros_like(rejecting_s)
         inputs_bar = cotangent_tree(inputs, perturbed.inputs, of_inputs)
         prepared_bar = cotangent_tree(prepared, perturbed.prepared, total)
         return prepared_bar, ScanInit(first, rejecting_s), inputs_bar

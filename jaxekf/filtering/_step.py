@@ -40,8 +40,8 @@ class FilterCarry(NamedTuple):
 
     belief: Belief
     rejecting_s: Array | None
-    """(lanes,) seconds of samples that gates have rejected since they last accepted one; None without
-    gates."""
+    """(groups, lanes) seconds of samples outside their bounds since the last one inside, for each of
+    `LoweredModel.reset_groups`; None if the model is never reset."""
 
 
 class StepOutput(NamedTuple):
@@ -60,16 +60,17 @@ class StepOutput(NamedTuple):
     gated: dict[str, Array]
     """By sensor: (rows, lanes) visible rows that a gate rejected."""
     recovered: Array | None
-    """(lanes,) where the gates were reset and the belief widened; None without gates."""
+    """(lanes,) where the belief was reset; None if the model is never reset."""
 
 
 def initial_carry(lowered: LoweredModel, belief: Belief, rejecting_s: Array | None) -> FilterCarry:
-    """The carry at the start of a run; `rejecting_s` (lanes,) as in `FilterCarry`, None for 0."""
-    if not lowered.is_gated:
+    """The carry at the start of a run; `rejecting_s` as in `FilterCarry`, or (lanes,), or None for 0."""
+    if not lowered.reset_groups:
         return FilterCarry(belief, None)
     if rejecting_s is None:
-        rejecting_s = jnp.zeros(belief.cov.shape[-1], belief.cov.dtype)
-    return FilterCarry(belief, rejecting_s)
+        rejecting_s = jnp.zeros((), belief.cov.dtype)
+    shape = (len(lowered.reset_groups), belief.cov.shape[-1])
+    return FilterCarry(belief, jnp.broadcast_to(rejecting_s, shape))
 
 
 def predict(bound: BoundModel, belief: Belief, inputs: SubstepInput) -> Belief:
@@ -111,23 +112,23 @@ def update(
         )
         smallest = jnp.minimum(smallest, pivot)
     healthy = (smallest > 0.0) & _has_valid_variances(posterior.cov)
-    carry = FilterCarry(posterior, result.rejecting_s)
+    rejecting_s = recovered = None
+    if result.resets is not None:
+        rejecting_s, recovered = result.resets.rejecting_s, result.resets.anywhere
+    carry = FilterCarry(posterior, rejecting_s)
     log_likelihood = accumulator.log_likelihood
-    return StepOutput(prior, carry, log_likelihood, healthy, used, gated, result.recovered)
+    return StepOutput(prior, carry, log_likelihood, healthy, used, gated, recovered)
 
 
 def linearise_and_gate(
     bound: BoundModel, predicted: FilterCarry, u: Any, samples: dict[str, Rows]
 ) -> tuple[GatingResult, Array]:
     """Every sensor linearised at the prediction, after gates and weights; and the predicted covariance,
-    inflated where the gates were reset."""
+    with the noise of resets."""
     prior = predicted.belief
     linear = linearise(bound, prior.mean, u, samples)
-    result = gating.gate_and_weight(
-        bound.lowered, linear, samples, prior.cov, predicted.rejecting_s
-    )
-    cov = prior.cov if result.inflation is None else prior.cov * result.inflation[None, None]
-    return result, cov
+    result = gating.gate_and_weight(bound, linear, samples, prior.cov, predicted.rejecting_s)
+    return result, prior.cov if result.resets is None else prior.cov + result.resets.added_cov
 
 
 def linearise(

@@ -1,0 +1,142 @@
+"""Reset of a belief that no sample agrees with, on the batch axis.
+
+Gates and weights assume that the belief is right and a sample may be wrong. If all samples of some
+sensors are outside their chi-square bounds for `Model.gate_reset_after_s`, the belief is taken to be
+wrong, whatever the outlier method: process noise is added to it at once, and the sample is used with
+full weight. The noise opens the states that these sensors observe. The other states, such as biases,
+get at most the variance of the start.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jaxekf.filtering.lowering.structured_matrix import Pattern
+
+_GROWTH = 99.0
+"""Variance that a reset adds to states that the sensors do not observe, as a multiple of theirs, if the
+gates have kept wrong samples from moving them: ten times the deviation."""
+
+
+class ResetGroup(NamedTuple):
+    """Sensors that observe common states, and so confirm or contradict the same part of the belief."""
+
+    sensors: tuple[str, ...]
+    observed: tuple[bool, ...]
+    """For each entry of the error vector, whether one of the sensors observes it."""
+    is_gated: bool
+    """Whether all of these sensors have a gate."""
+
+
+class ResetTally(NamedTuple):
+    """Summary of the samples of a group at one instant, each (lanes,)."""
+
+    accepted: Array
+    """Whether any sample is within its bound."""
+    rejected: Array
+    rejected_s: Array
+    """The longest sampling period of the samples outside their bounds."""
+    excess: Array
+    """The largest ratio of squared error to expected squared error among groups of rows outside their
+    bounds; for repeated groups their geometric mean, in which a few that are far off count little."""
+
+
+class Resets(NamedTuple):
+    """The resets of all groups at one instant."""
+
+    rejecting_s: Array
+    """(groups, lanes) as in `FilterCarry`, after this instant."""
+    recovered: dict[str, Array]
+    """By sensor: (lanes,) where its group is reset."""
+    added_cov: Array
+    """(n, n, lanes) process noise of the resets; zero where there is none."""
+
+    @property
+    def anywhere(self) -> Array:
+        """(lanes,) where any group is reset."""
+        return jnp.stack(list(self.recovered.values())).any(axis=0)
+
+
+def find_groups(
+    patterns: Mapping[str, Pattern], gated: Mapping[str, bool]
+) -> tuple[ResetGroup, ...]:
+    """The groups of a model's sensors, from the sparsity of their Jacobians."""
+    found: list[tuple[list[str], np.ndarray]] = []
+    for name, pattern in patterns.items():
+        observed = (pattern.base != 0.0).any(axis=0)
+        for _, cols in pattern.bands:
+            observed[list(cols)] = True
+        joined, others = [name], []
+        for names, states in found:
+            if (states & observed).any():
+                joined, observed = names + joined, states | observed
+            else:
+                others.append((names, states))
+        found = [*others, (joined, observed)]
+    return tuple(
+        ResetGroup(tuple(names), tuple(states.tolist()), all(gated[name] for name in names))
+        for names, states in found
+    )
+
+
+def reset(
+    groups: tuple[ResetGroup, ...],
+    tallies: Mapping[str, ResetTally],
+    rejecting_s: Array,
+    after_s: float,
+    prior_cov: Array,
+    initial_variance: Array,
+) -> Resets:
+    """The counters of all groups after an instant, and the resets.
+
+    Parameters
+    ----------
+    groups
+        The model's groups.
+    tallies
+        By sensor, for those sampled at this instant.
+    rejecting_s
+        (groups, lanes) seconds, as in `FilterCarry`.
+    after_s
+        `Model.gate_reset_after_s`.
+    prior_cov
+        Predicted covariance, (n, n, lanes).
+    initial_variance
+        (n, lanes) variances at the start of a run.
+    """
+    variance = jnp.stack([prior_cov[i, i] for i in range(prior_cov.shape[0])])
+    counters, recovered = [], {}
+    added = jnp.zeros_like(prior_cov)
+    for counter, group in zip(rejecting_s, groups, strict=True):
+        sampled = [tallies[name] for name in group.sensors if name in tallies]
+        if not sampled:
+            counters.append(counter)
+            continue
+        tally = sampled[0]
+        for other in sampled[1:]:
+            tally = ResetTally(
+                tally.accepted | other.accepted,
+                tally.rejected | other.rejected,
+                jnp.maximum(tally.rejected_s, other.rejected_s),
+                jnp.maximum(tally.excess, other.excess),
+            )
+        # Earlier samples must have filled the time: a single one is outside whatever its period.
+        here = tally.rejected & ~tally.accepted & (counter > after_s)
+        cleared = here | tally.accepted
+        counters.append(jnp.where(cleared, 0.0, counter + tally.rejected_s))
+        recovered |= {name: here for name in group.sensors if name in tallies}
+        opened = jnp.where(here, tally.excess - 1.0, 0.0)
+        if group.is_gated:
+            grown = jnp.minimum(_GROWTH * variance, initial_variance)
+        else:
+            grown = tally.excess * variance
+        allowed = jnp.where(here, grown, 0.0)
+        inside = np.array(group.observed)
+        both = jnp.asarray(np.outer(inside, inside), prior_cov.dtype)[..., None]
+        outside = jnp.asarray(np.diag(~inside), prior_cov.dtype)[..., None]
+        added = added + prior_cov * (both * lax.stop_gradient(opened))
+        added = added + outside * lax.stop_gradient(allowed)[None]
+    return Resets(jnp.stack(counters), recovered, added)

@@ -142,13 +142,9 @@ def _optics(entries: Mapping[str, Any], place: Path | str, head: str = "") -> di
             )
         found[key] = facts.finite_vector(entries[key], 2, place, f"{head}{key}")
     if (found["focal"] <= 0.0).any():
-        raise RecordingError(
-            place,
-            f"{head}focal = {found['focal'].tolist()}",
-            "two positive numbers of pixels",
-            "turning the image, not the focal length",
-            column=f"{head}focal",
-        )
+        focal, hint = found["focal"].tolist(), "turning the image, not the focal length"
+        expected = "two positive numbers of pixels"
+        raise facts.wrong_entry(place, f"{head}focal", focal, expected, hint)
     for key, size in (("radial", 2), ("p_body_camera", 3)):
         if key in entries:
             found[key] = facts.finite_vector(entries[key], size, place, f"{head}{key}")

@@ -130,9 +130,7 @@ def _geometry(geometry: Any, place: Path | str) -> tuple[tuple[str, ...], Floats
     """Names (M) and places in the body (M, 3)."""
     key = "markers.geometry"
     if geometry is not None and not isinstance(geometry, dict):
-        raise RecordingError(
-            place, f"{key} = {geometry!r}", "a section", f"writing it as [{key}]", column=key
-        )
+        raise facts.wrong_entry(place, key, geometry, "a section", f"writing it as [{key}]")
     geometry = geometry or {}
     _check_names(tuple(geometry), place)
     places = [facts.finite_vector(p, 3, place, f"{key}.{name}") for name, p in geometry.items()]

@@ -33,16 +33,15 @@ def check_names(place: str, label: str, names: set[str], fields: Mapping[str, Fi
         )
 
 
-def check_described(place: str, key: str, about: Mapping[str, str], field: Field) -> None:
+def check_described(place: str, key: str, about: Mapping[str, Any], field: Field) -> None:
     """Unit and frame, where stated, are those that this version reads."""
     for name, expected in field.described.items():
-        if name in about and about[name] != expected:
-            raise RecordingError(
-                f"{place}:{key}@{name}",
-                f"'{about[name]}'",
-                f"'{expected}'",
-                "converting the numbers, or leaving the attribute out where it is only another word",
+        where = f"{key}@{name}"
+        if where in about and (stated := str(about[where])) != expected:
+            hint = (
+                "converting the numbers, or leaving the attribute out where it is only another word"
             )
+            raise RecordingError(f"{place}:{where}", f"'{stated}'", f"'{expected}'", hint)
 
 
 def check_type(place: str, key: str, dtype: np.dtype, field: Field) -> None:

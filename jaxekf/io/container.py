@@ -114,12 +114,8 @@ def _field(key: str) -> Field:
 def _check_root(path: Path, attributes: Mapping[str, Any]) -> None:
     for key, expected in (("kind", layout.KIND), ("schema_version", SCHEMA_VERSION)):
         if key in attributes and attributes[key] != expected:
-            place, got, hint = (
-                f"{path}@{key}",
-                f"{attributes[key]!r}",
-                "a run written for this version",
-            )
-            raise RecordingError(place, got, f"{expected!r}", hint)
+            got, hint = f"{attributes[key]!r}", "a run written for this version"
+            raise RecordingError(f"{path}@{key}", got, f"{expected!r}", hint)
     for key in ("name", "info", "sha256"):
         if not isinstance(attributes.get(key, ""), str):
             got = f"{attributes[key]!r}"

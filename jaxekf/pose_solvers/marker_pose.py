@@ -129,13 +129,8 @@ def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
     """
     if fit is None:
         fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
-    return Optical(
-        markers.time_ns,
-        fit.q_ref_body,
-        fit.valid,
-        fit.position,
-        latency_ns=markers.latency_ns,
-    )
+    late = markers.latency_ns
+    return Optical(markers.time_ns, fit.q_ref_body, fit.valid, fit.position, latency_ns=late)
 
 
 def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Floats:

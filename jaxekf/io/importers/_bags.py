@@ -176,19 +176,14 @@ def _reader(path: Path) -> tuple[Any, Any]:
             "rosbags to be installed",
             "pip install 'jaxekf[ros]'",
         ) from error
-    if not _is_ros1(path):
-        try:
-            return rosbag2.Reader(path), get_typestore(Stores.LATEST)
-        except Exception as error:
-            raise unreadable(path, error) from error
-    # ROS 1 defines transforms in a package of its own, which the library's standard types leave out.
-    typestore = get_typestore(Stores.ROS1_NOETIC)
-    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
-        typestore.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name)
-        )
+    typestore = get_typestore(Stores.ROS1_NOETIC if _is_ros1(path) else Stores.LATEST)
+    if _is_ros1(path):
+        # ROS 1 defines transforms in a package of its own, which the library's standard types leave out.
+        content = "geometry_msgs/TransformStamped[] transforms\n"
+        for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+            typestore.register(get_types_from_msg(content, name))
     try:
-        return rosbag1.Reader(path), typestore
+        return (rosbag1 if _is_ros1(path) else rosbag2).Reader(path), typestore
     except Exception as error:
         raise unreadable(path, error) from error
 

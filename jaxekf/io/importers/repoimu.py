@@ -85,7 +85,7 @@ def load(path: Path | str) -> Recording:
         optical, account = screening.optical(place, time_ns, values[:, :4])
     # Semicolons are this format's own delimiter and need no note.
     accounts = {
-        label: replace(accounted(one, source), notes=one.notes)
+        label: replace(accounted(one, source.table, source.dropped), notes=one.notes)
         for label, one in (("imu", imu_account), ("optical", account))
     }
     return Recording(

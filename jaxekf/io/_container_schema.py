@@ -25,12 +25,10 @@ def check_names(place: str, label: str, names: set[str], fields: Mapping[str, Fi
         wrong = [f"without {', '.join(missing)}"] if missing else []
         wrong += [f"with the unknown {', '.join(unknown)}"] if unknown else []
         layout = ", ".join(key if field.needed else f"[{key}]" for key, field in fields.items())
-        raise RecordingError(
-            f"{place}:{label}",
-            f"the data sets {', '.join(sorted(names)) or 'none'}, {' and '.join(wrong)}",
-            f"{layout} (those in brackets may be left out)",
-            "adding, renaming or removing data sets",
-        )
+        got = f"the data sets {', '.join(sorted(names)) or 'none'}, {' and '.join(wrong)}"
+        expected = f"{layout} (those in brackets may be left out)"
+        hint = "adding, renaming or removing data sets"
+        raise RecordingError(f"{place}:{label}", got, expected, hint)
 
 
 def check_described(place: str, key: str, about: Mapping[str, Any], field: Field) -> None:

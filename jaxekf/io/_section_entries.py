@@ -62,13 +62,9 @@ def check_keys(
         near = [] if key in names else get_close_matches(key, names, 1, 0.8)
         if near:
             head = f"{label}." if label else ""
-            raise RecordingError(
-                place,
-                f"{head}{key}",
-                f"{head}{near[0]}",
-                "correcting the name, or another one for a fact of your own",
-                column=f"{head}{key}",
-            )
+            got = f"{head}{key}"
+            hint = "correcting the name, or another one for a fact of your own"
+            raise RecordingError(place, got, f"{head}{near[0]}", hint, column=f"{head}{key}")
 
 
 def layout(label: str, about: Mapping[str, Any], place: Path | str) -> Layout:

@@ -33,13 +33,9 @@ def read_description(folder: Path) -> dict[str, Any]:
         ) from error
     version = about.get("schema_version")
     if version != SCHEMA_VERSION:
-        raise RecordingError(
-            file,
-            f"schema_version {version!r}",
-            f"{SCHEMA_VERSION}",
-            "a run written for this version",
-            column="schema_version",
-        )
+        got = f"schema_version {version!r}"
+        hint = "a run written for this version"
+        raise RecordingError(file, got, f"{SCHEMA_VERSION}", hint, column="schema_version")
     return about
 
 

@@ -303,12 +303,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):
-            raise RecordingError(
-                self.path or "recording",
-                f"the name {self.name!r}",
-                "a name that can be a folder's",
-                "changing it in recording.toml",
-            )
+            got = f"the name {self.name!r}"
+            expected = "a name that can be a folder's"
+            hint = "changing it in recording.toml"
+            raise RecordingError(self.path or "recording", got, expected, hint)
         for label, stream in self.streams.items():
             _check_stream(self.path or self.name, label, stream)
 
@@ -346,12 +344,10 @@ class Recording:
         """
         stream = self._need(label)
         if name not in stream.values:
-            raise RecordingError(
-                self.path or self.name,
-                f"no field {name} of {label}",
-                f"one of {', '.join(stream.values)}",
-                f"adding its columns to {label}.csv, or another field",
-            )
+            got = f"no field {name} of {label}"
+            expected = f"one of {', '.join(stream.values)}"
+            hint = f"adding its columns to {label}.csv, or another field"
+            raise RecordingError(self.path or self.name, got, expected, hint)
         value = stream.values[name]
         finite = np.isfinite(value).all(axis=1)
         taken = stream.time_ns - stream.latency_ns
@@ -380,12 +376,9 @@ class Recording:
     def _need(self, label: str) -> Any:
         stream = self.streams.get(label)
         if stream is None:
-            raise RecordingError(
-                self.path or self.name,
-                f"no {label} stream",
-                "one for what was asked",
-                f"adding {label}.csv and its section to recording.toml",
-            )
+            got = f"no {label} stream"
+            hint = f"adding {label}.csv and its section to recording.toml"
+            raise RecordingError(self.path or self.name, got, "one for what was asked", hint)
         return stream
 
 

@@ -9,15 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaxekf.geometry import pinhole
-from jaxekf.recordings.types import (
-    Camera,
-    Flags,
-    Floats,
-    Recording,
-    Times,
-    from_scipy,
-    to_scipy,
-)
+from jaxekf.recordings.types import Camera, Flags, Floats, Recording, Times, from_scipy, to_scipy
 from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
 from jaxekf.simulation.marker_runs import ToolGrade, ToolMotion, Unrecorded, with_truth
 

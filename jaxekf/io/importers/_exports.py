@@ -71,12 +71,9 @@ class Export(NamedTuple):
         for line in self.head:
             if {name.lower() for name in names} <= {bare(cell) for cell in line.cells}:
                 return line
-        raise RecordingError(
-            self.path,
-            f"no line with {', '.join(names)} among the first {len(self.head)}",
-            expected,
-            "another file, or exporting again with quaternions and positions",
-        )
+        got = f"no line with {', '.join(names)} among the first {len(self.head)}"
+        hint = "another file, or exporting again with quaternions and positions"
+        raise RecordingError(self.path, got, expected, hint)
 
     def table(self, header: HeaderLine, width: int, end: int | None = None) -> Table:
         """The rows below a header, up to an offset; the columns are called by their number."""

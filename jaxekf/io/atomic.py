@@ -11,7 +11,7 @@ from typing import Any
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _temporary as temporary
 
-_ANOTHER = "another output or --overwrite (in Python overwrite=True)"
+_OVERWRITE = "--overwrite (in Python overwrite=True)"
 _HEAD = 1000
 """Bytes at the beginning of a file that must contain its marker."""
 
@@ -26,7 +26,9 @@ def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> N
             target, f"a path that exists and holds no {marker}", "a new one", "another output"
         )
     if not overwrite:
-        raise RecordingError(target, "a path that exists", "a new one", _ANOTHER)
+        raise RecordingError(
+            target, "a path that exists", "a new one", f"another output or {_OVERWRITE}"
+        )
 
 
 @contextmanager
@@ -121,7 +123,7 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         if target.is_dir():
             got = "a folder"
         elif target.is_file():
-            got, hint = "a file that exists", _ANOTHER.replace("output", "path")
+            got, hint = "a file that exists", f"another path or {_OVERWRITE}"
         raise RecordingError(target, got, "a new file", hint)
     temporary.sweep(target)
     made = temporary.beside(target, target.suffix)
@@ -171,7 +173,9 @@ def check_file(path: Path | str, marker: str, *, overwrite: bool = False) -> Non
             target, f"a file that holds no {marker}", "a new one", "another output"
         )
     if not overwrite:
-        raise RecordingError(target, "a file that exists", "a new one", _ANOTHER)
+        raise RecordingError(
+            target, "a file that exists", "a new one", f"another output or {_OVERWRITE}"
+        )
 
 
 def write_whole(path: Path | str, text: str) -> None:

@@ -84,8 +84,29 @@ class Manifold(ABC):
         )
 
 
+class _Additive(Manifold):
+    """A part whose error is added to its stored numbers."""
+
+    @property
+    def error_labels(self) -> tuple[str, ...]:
+        return self.component_labels
+
+    @property
+    def curved(self) -> bool:
+        return False
+
+    def retract(self, x: Array, delta: Array) -> Array:
+        return x + delta
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        return delta
+
+    def lower(self, x: Array, change: Array) -> Array:
+        return change
+
+
 @dataclass(frozen=True)
-class Euclidean(Manifold):
+class Euclidean(_Additive):
     """A vector of `size` components with additive error."""
 
     size: int
@@ -107,25 +128,8 @@ class Euclidean(Manifold):
             return self.labels
         return _AXES if self.size == 3 else tuple(str(i) for i in range(self.size))
 
-    @property
-    def error_labels(self) -> tuple[str, ...]:
-        return self.component_labels
-
-    @property
-    def curved(self) -> bool:
-        return False
-
-    def retract(self, x: Array, delta: Array) -> Array:
-        return x + delta
-
     def local(self, x: Array, y: Array) -> Array:
         return y - x
-
-    def lift(self, x: Array, delta: Array) -> Array:
-        return delta
-
-    def lower(self, x: Array, change: Array) -> Array:
-        return change
 
 
 @dataclass(frozen=True)
@@ -167,7 +171,7 @@ class SO3(Manifold):
 
 
 @dataclass(frozen=True)
-class AdditiveQuaternion(Manifold):
+class AdditiveQuaternion(_Additive):
     """A quaternion as four independent components with additive error, as in Cheng (2023).
 
     Both signs of a quaternion are the same rotation, so `local` takes the sign of ``y`` nearer to
@@ -188,25 +192,8 @@ class AdditiveQuaternion(Manifold):
     def component_labels(self) -> tuple[str, ...]:
         return ("w", *_AXES)
 
-    @property
-    def error_labels(self) -> tuple[str, ...]:
-        return ("w", *_AXES)
-
-    @property
-    def curved(self) -> bool:
-        return False
-
-    def retract(self, x: Array, delta: Array) -> Array:
-        return x + delta
-
     def local(self, x: Array, y: Array) -> Array:
         return jnp.where(jnp.sum(x * y) < 0.0, -y, y) - x
-
-    def lift(self, x: Array, delta: Array) -> Array:
-        return delta
-
-    def lower(self, x: Array, change: Array) -> Array:
-        return change
 
 
 class Part(NamedTuple):

@@ -50,12 +50,9 @@ def files_of(folder: Path | str, formats: Iterable[str]) -> dict[str, str]:
     wanted = list(dict.fromkeys(formats))
     for name in wanted:
         if name not in FILES:
-            raise RecordingError(
-                folder,
-                f"the format '{name}'",
-                f"one of {', '.join(FILES)}",
-                "one of these (estimate.csv is always there)",
-            )
+            expected = f"one of {', '.join(FILES)}"
+            hint = "one of these (estimate.csv is always there)"
+            raise RecordingError(folder, f"the format '{name}'", expected, hint)
     return {name: FILES[name] for name in wanted}
 
 
@@ -71,7 +68,7 @@ def write_npz(path: Path, entries: Mapping[str, Entry]) -> None:
 
 def _array(value: Any) -> Any:
     # Without its type a list of no texts would become numbers.
-    return np.array(value, str) if isinstance(value, list) else np.asarray(value)
+    return np.array(value, str) if isinstance(value, list | tuple) else np.asarray(value)
 
 
 def write_hdf5(path: Path, entries: Mapping[str, Entry]) -> None:
@@ -152,12 +149,8 @@ def read_export(path: Path | str) -> dict[str, Any]:
         ) from error
     attribute = (found.get("kind"), found.get("schema_version"))
     if attribute != (KIND, SCHEMA_VERSION):
-        raise RecordingError(
-            path,
-            f"kind and schema_version {attribute}",
-            str((KIND, SCHEMA_VERSION)),
-            "exporting again with this version",
-        )
+        got, expected = f"kind and schema_version {attribute}", str((KIND, SCHEMA_VERSION))
+        raise RecordingError(path, got, expected, "exporting again with this version")
     return found
 
 

@@ -78,14 +78,9 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / facts.FILE
     section_entries.check_keys(about, "", place, run_keys())
-    if not isinstance(about.get("trust_units", False), bool):
-        raise RecordingError(
-            place,
-            f"trust_units = {about['trust_units']!r}",
-            "true or false",
-            "correcting it",
-            column="trust_units",
-        )
+    if not isinstance(trusted := about.get("trust_units", False), bool):
+        hint = "correcting it"
+        raise facts.wrong_entry(place, "trust_units", trusted, "true or false", hint)
     hashes = _hashes(about, place)
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
@@ -127,21 +122,12 @@ def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
     """Hashes of a run's files in ``[sha256]``, by name."""
     hashes = about.get("sha256", {})
     if not isinstance(hashes, dict) or not all(isinstance(v, str) for v in hashes.values()):
-        raise RecordingError(
-            place,
-            f"sha256 = {hashes!r}",
-            "a section with a hash for each file",
-            "correcting or removing it",
-            column="sha256",
-        )
+        expected, hint = "a section with a hash for each file", "correcting or removing it"
+        raise facts.wrong_entry(place, "sha256", hashes, expected, hint)
     for name in hashes:
         if not (place.parent / name).is_file():
-            raise RecordingError(
-                place,
-                f"a hash of {name}, which is not there",
-                "one of each file",
-                "correcting its name",
-            )
+            got = f"a hash of {name}, which is not there"
+            raise RecordingError(place, got, "one of each file", "correcting its name")
     return hashes
 
 

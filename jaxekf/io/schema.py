@@ -227,13 +227,7 @@ class StreamSchema:
         """Arrays by field, SI units, of a table that has a column for each number."""
         section, place = source.about, source.place
         assert self.units is not None
-        scale = dict(
-            zip(
-                self.units,
-                factors(self.name, self.units, section, place),
-                strict=True,
-            )
-        )
+        scale = dict(zip(self.units, factors(self.name, self.units, section, place), strict=True))
         turning = section_entries.turning(self.name, section, place)
         found: dict[str, Any] = {"time_ns": stamps(table)}
         for name, option in self.options.items():

@@ -12,15 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxekf._support.deprecations import renamed
 from jaxekf.geometry.host_rotation import running_product
-from jaxekf.recordings.types import (
-    NANOSECONDS,
-    Flags,
-    Floats,
-    Imu,
-    from_scipy,
-    period_ns,
-    to_scipy,
-)
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, from_scipy, period_ns, to_scipy
 
 _SETTLING_S = 3.0
 """Time constant, s, of the low-pass in the non-rotating frame, which averages out accelerations of a

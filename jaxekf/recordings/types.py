@@ -174,15 +174,9 @@ class Markers(_Stream):
             "visible": (len(self.time_ns), count),
             "p_body_marker": (count, 3),
         }
-        for key, shape in shapes.items():
-            got = np.shape(getattr(self, key))
-            if got != shape:
-                raise RecordingError(
-                    "markers",
-                    f"{key} of shape {got}",
-                    f"{shape} for {len(self.time_ns)} frames of {count} markers",
-                    "giving every marker its place in the body and in every frame",
-                )
+        counted = f"{len(self.time_ns)} frames of {count} markers"
+        hint = "giving every marker its place in the body and in every frame"
+        _check_shapes("markers", self, shapes, counted, hint)
 
 
 @dataclass(frozen=True)
@@ -244,15 +238,8 @@ class Camera(_Stream):
         }
         if self.sigma is not None:
             shapes["sigma"] = (images, count)
-        for key, shape in shapes.items():
-            got = np.shape(getattr(self, key))
-            if got != shape:
-                raise RecordingError(
-                    "camera",
-                    f"{key} of shape {got}",
-                    f"{shape} for {images} images of {count} landmarks",
-                    "giving every landmark its place in the scene and in every image",
-                )
+        hint = "giving every landmark its place in the scene and in every image"
+        _check_shapes("camera", self, shapes, f"{images} images of {count} landmarks", hint)
 
 
 @dataclass(frozen=True)
@@ -316,12 +303,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or set(self.name) & set("/\\\0"):
-            raise RecordingError(
-                self.path or "recording",
-                f"the name {self.name!r}",
-                "a name that can be a folder's",
-                "changing it in recording.toml",
-            )
+            got = f"the name {self.name!r}"
+            expected = "a name that can be a folder's"
+            hint = "changing it in recording.toml"
+            raise RecordingError(self.path or "recording", got, expected, hint)
         for label, stream in self.streams.items():
             _check_stream(self.path or self.name, label, stream)
 
@@ -359,12 +344,10 @@ class Recording:
         """
         stream = self._need(label)
         if name not in stream.values:
-            raise RecordingError(
-                self.path or self.name,
-                f"no field {name} of {label}",
-                f"one of {', '.join(stream.values)}",
-                f"adding its columns to {label}.csv, or another field",
-            )
+            got = f"no field {name} of {label}"
+            expected = f"one of {', '.join(stream.values)}"
+            hint = f"adding its columns to {label}.csv, or another field"
+            raise RecordingError(self.path or self.name, got, expected, hint)
         value = stream.values[name]
         finite = np.isfinite(value).all(axis=1)
         taken = stream.time_ns - stream.latency_ns
@@ -393,46 +376,40 @@ class Recording:
     def _need(self, label: str) -> Any:
         stream = self.streams.get(label)
         if stream is None:
-            raise RecordingError(
-                self.path or self.name,
-                f"no {label} stream",
-                "one for what was asked",
-                f"adding {label}.csv and its section to recording.toml",
-            )
+            got = f"no {label} stream"
+            hint = f"adding {label}.csv and its section to recording.toml"
+            raise RecordingError(self.path or self.name, got, "one for what was asked", hint)
         return stream
+
+
+def _check_shapes(
+    label: str, stream: Any, shapes: Mapping[str, tuple[int, ...]], counted: str, hint: str
+) -> None:
+    for key, shape in shapes.items():
+        got = np.shape(getattr(stream, key))
+        if got != shape:
+            raise RecordingError(label, f"{key} of shape {got}", f"{shape} for {counted}", hint)
 
 
 def _check_stream(place: Path | str, label: str, stream: Any) -> None:
     """Lengths agree, there is at least one sample, time increases."""
     times = stream.time_ns
     if times.dtype != np.int64:
-        raise RecordingError(
-            place,
-            f"{label} times of type {times.dtype}",
-            "int64 nanoseconds",
-            "casting them exactly",
-        )
+        got = f"{label} times of type {times.dtype}"
+        raise RecordingError(place, got, "int64 nanoseconds", "casting them exactly")
     for key, value in stream.arrays.items():
         if len(value) != len(times):
-            raise RecordingError(
-                place,
-                f"{len(value)} values of {label}.{key} for {len(times)} times",
-                "as many values as times",
-                "writing every sample's row whole",
-            )
+            got = f"{len(value)} values of {label}.{key} for {len(times)} times"
+            hint = "writing every sample's row whole"
+            raise RecordingError(place, got, "as many values as times", hint)
     if len(times) == 0:
         raise RecordingError(place, f"0 samples in {label}", "at least one", "recording again")
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if backwards.size:
         first = int(backwards[0])
-        raise RecordingError(
-            place,
-            f"{label} time {times[first + 1]} ns after {times[first]} ns",
-            "times that increase",
-            "sorting the samples and removing duplicates",
-            line=first + 3,
-            column="time",
-        )
+        got = f"{label} time {times[first + 1]} ns after {times[first]} ns"
+        expected, hint = "times that increase", "sorting the samples and removing duplicates"
+        raise RecordingError(place, got, expected, hint, line=first + 3, column="time")
 
 
 def to_scipy(q: Floats) -> Rotation:

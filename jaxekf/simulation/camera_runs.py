@@ -9,18 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaxekf.geometry import pinhole
-from jaxekf.recordings.types import (
-    Camera,
-    Encoder,
-    Flags,
-    Floats,
-    Recording,
-    Times,
-    from_scipy,
-    to_scipy,
-)
+from jaxekf.recordings.types import Camera, Flags, Floats, Recording, Times, from_scipy, to_scipy
 from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
-from jaxekf.simulation.marker_runs import ToolGrade, ToolMotion, Unrecorded, tool_imu
+from jaxekf.simulation.marker_runs import ToolGrade, ToolMotion, Unrecorded, with_truth
 
 PERIOD_S = 5.4
 GRAVITY_REF = np.array([-9.81, 0.0, 0.0])
@@ -201,14 +192,8 @@ def camera_run(
     imu_ns = sample_times(1.0 / grade.imu.imu_s, duration_s, start_ns)
     images = sample_times(grade.camera_hz, duration_s, start_ns)
     camera = _camera(motion, images, landmarks, grade, mount, blind, rng)
-    imu, *biases = tool_imu(motion, imu_ns, rng, grade.imu, GRAVITY_REF)
-    t = seconds(imu_ns)
-    known = np.ones(len(imu_ns), bool)
-    q, _ = motion.attitude.attitude(t)
-    truth = Encoder(imu_ns, q, known, known, motion.position(t))
     info = {"simulated": True, "seed": seed, "gravity_ref": GRAVITY_REF.tolist()}
-    recording = Recording(name, None, imu, truth, info, camera=camera)
-    return recording, Unrecorded(motion.velocity(t), *biases)
+    return with_truth(Recording(name, info=info, camera=camera), motion, imu_ns, rng, grade.imu)
 
 
 def _camera(

@@ -244,10 +244,7 @@ def _rates(
 
 
 def array_rate(
-    array: AccelerometerArray,
-    readings: Floats,
-    grade: SurgeryGrade,
-    forget_s: float = FORGET_S,
+    array: AccelerometerArray, readings: Floats, grade: SurgeryGrade, forget_s: float = FORGET_S
 ) -> Floats:
     """Angular rate (N, 3), rad/s, from an array's readings (N, n), with an unknown initial rate.
 

@@ -197,13 +197,25 @@ def tool_run(
     taken = sample_times(1.0 / grade.tracker_s, duration_s, start_ns)
     imu_ns = sample_times(1.0 / grade.imu_s, duration_s, start_ns)
     markers = tool_markers(motion, tool, taken, rng, grade, hidden)
-    q, _ = motion.attitude.attitude(seconds(imu_ns))
-    known = np.ones(len(imu_ns), bool)
-    truth = Encoder(imu_ns, q, known, known, motion.position(seconds(imu_ns)))
-    imu, *biases = tool_imu(motion, imu_ns, rng, grade)
     info = {"simulated": True, "seed": seed, "gravity_ref": GRAVITY_REF.tolist()}
-    recording = Recording(name, None, imu, truth, info, markers=markers)
-    return recording, Unrecorded(motion.velocity(seconds(imu_ns)), *biases)
+    return with_truth(Recording(name, info=info, markers=markers), motion, imu_ns, rng, grade)
+
+
+def with_truth(
+    tracked: Recording,
+    motion: ToolMotion,
+    imu_ns: Times,
+    rng: np.random.Generator,
+    grade: ToolGrade,
+) -> tuple[Recording, Unrecorded]:
+    """A run of a tracker alone with the IMU, the true pose and velocity at the IMU's times."""
+    t = seconds(imu_ns)
+    q, _ = motion.attitude.attitude(t)
+    known = np.ones(len(imu_ns), bool)
+    truth = Encoder(imu_ns, q, known, known, motion.position(t))
+    gravity_ref = np.array(tracked.info["gravity_ref"])
+    imu, *biases = tool_imu(motion, imu_ns, rng, grade, gravity_ref)
+    return tracked.replace(imu=imu, encoder=truth), Unrecorded(motion.velocity(t), *biases)
 
 
 def tool_markers(
@@ -241,22 +253,12 @@ def tool_imu(
     t = seconds(time_ns)
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - gravity_ref)
-    turning, bias = _biased(
-        rate,
-        rng,
-        grade.imu_s,
-        np.deg2rad(grade.gyroscope_deg),
-        np.deg2rad(grade.bias_walk_deg),
-        np.deg2rad(grade.bias_deg),
-    )
-    pushing, accelerometer_bias = _biased(
-        force,
-        rng,
-        grade.imu_s,
-        1e-3 * constants.STANDARD_GRAVITY * grade.accelerometer_mg,
-        grade.accelerometer_walk,
-        grade.accelerometer_bias,
-    )
+    dt = grade.imu_s
+    gyroscope = np.deg2rad([grade.gyroscope_deg, grade.bias_walk_deg, grade.bias_deg])
+    turning, bias = _biased(rate, rng, dt, *gyroscope)
+    white = 1e-3 * constants.STANDARD_GRAVITY * grade.accelerometer_mg
+    walk, start = grade.accelerometer_walk, grade.accelerometer_bias
+    pushing, accelerometer_bias = _biased(force, rng, dt, white, walk, start)
     return Imu(time_ns, turning, pushing), bias, accelerometer_bias
 
 

@@ -19,6 +19,7 @@ from jaxekf.cli.console import (
     json_option,
     model_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -39,9 +40,7 @@ from jaxekf.recordings.types import Floats
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @model_option
 @sort_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("aligned"), show_default=True
-)
+@output_option("aligned")
 @overwrite_option
 @json_option
 def align(

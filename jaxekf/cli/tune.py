@@ -11,10 +11,12 @@ import tuning
 from jaxekf._support import memory
 from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
 from jaxekf.cli.console import (
+    default_option,
     json_option,
     model_option,
     noise_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -62,11 +64,11 @@ _RENAMED = {
 @model_option
 @noise_option
 @sort_option
-@click.option(
+@default_option(
     "--objective",
-    default="attitude",
-    show_default=True,
-    help="Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
+    None,
+    "attitude",
+    "Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
     " attitude+0.1*likelihood.",
 )
 @click.option(
@@ -93,20 +95,18 @@ _RENAMED = {
     help="Shape of free noise: one deviation for all axes, one for each, or a full matrix.  [default: as at"
     " the start]",
 )
-@click.option(
+@default_option(
     "--optimiser",
-    type=click.Choice(tuple(NAMED)),
-    default="lbfgs",
-    show_default=True,
-    help="Optimiser: lbfgs; fisher scoring, which takes few steps, for likelihood or map with up to about"
+    click.Choice(tuple(NAMED)),
+    "lbfgs",
+    "Optimiser: lbfgs; fisher scoring, which takes few steps, for likelihood or map with up to about"
     " thirty numbers; adam on minibatches, for very many runs.",
 )
-@click.option(
+@default_option(
     "--starts",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Number of starts, the given one and samples about it; successive halving drops the worse half"
+    click.IntRange(1),
+    1,
+    "Number of starts, the given one and samples about it; successive halving drops the worse half"
     " after 8, 16 and 32 iterations.",
 )
 @click.option(
@@ -114,33 +114,18 @@ _RENAMED = {
     type=click.IntRange(1),
     help="Runs per step of adam; an iteration is a pass over all runs.  [default: 16]",
 )
-@click.option(
+@default_option(
     "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Seed of the sampled starts, and of the order of adam's batches.",
+    click.IntRange(0),
+    0,
+    "Seed of the sampled starts, and of the order of adam's batches.",
 )
-@click.option(
-    "--iterations",
-    type=click.IntRange(1),
-    default=60,
-    show_default=True,
-    help="Largest number of iterations.",
+@default_option("--iterations", click.IntRange(1), 60, "Largest number of iterations.")
+@default_option(
+    "--patience", click.IntRange(1), 15, "Largest number of iterations without improvement."
 )
-@click.option(
-    "--patience",
-    type=click.IntRange(1),
-    default=15,
-    show_default=True,
-    help="Largest number of iterations without improvement.",
-)
-@click.option(
-    "--burn-in",
-    type=click.FloatRange(0.0),
-    default=0.0,
-    show_default=True,
-    help="Time at the start of each run that does not count, s.",
+@default_option(
+    "--burn-in", click.FloatRange(0.0), 0.0, "Time at the start of each run that does not count, s."
 )
 @click.option(
     "--rescale/--no-rescale",
@@ -149,11 +134,11 @@ _RENAMED = {
     " and the objective has errors alone]",
 )
 @click.option("--smooth", is_flag=True, help="Errors of the smoothed estimate.")
-@click.option(
+@default_option(
     "--confidence-intervals/--no-confidence-intervals",
-    default=True,
-    show_default=True,
-    help="95 % confidence intervals from the Fisher information; unobservable parameters revert to their"
+    None,
+    True,
+    "95 % confidence intervals from the Fisher information; unobservable parameters revert to their"
     " initial values.",
 )
 @click.option(
@@ -171,14 +156,7 @@ _RENAMED = {
 @folds_option
 @baselines_option
 @static_option
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    default=Path("tuned"),
-    show_default=True,
-    help="Output folder.",
-)
+@output_option("tuned", "Output folder.")
 @overwrite_option
 @json_option
 def tune(

@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Any
 
 import click
-import jax
 import numpy as np
 
 import tuning
 from jaxekf._support import memory
-from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
+from jaxekf.cli.comparison import in_degrees, print_comparison, short
 from jaxekf.cli.console import (
     default_option,
     json_option,
@@ -322,12 +321,11 @@ def _print_known(tuned: tuning.Tuned) -> None:
 
 
 def _print_noise(tuned: tuning.Tuned) -> None:
-    units = units_by_name(tuned.model)
-    names = parameters.leaf_names(tuned.params)
-    before = jax.tree.leaves(tuned.start._replace(truth=()))
-    after = jax.tree.leaves(tuned.params)
+    units = parameters.leaves_by_name(tuned.model.units)
+    before = parameters.leaves_by_name(tuned.start._replace(truth=()))
     rows = []
-    for name, old, new in zip(names, before, after, strict=True):
+    for name, new in parameters.leaves_by_name(tuned.params).items():
+        old = before[name]
         if np.array_equal(old, new):
             continue
         turn, shown = in_degrees(units[name])

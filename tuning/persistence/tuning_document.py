@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import leaf_names
+from jaxekf.estimation.parameters import leaf_names, leaves_by_name
 from jaxekf.io.documents import codec
 from jaxekf.io.documents.tuning import TuningDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
@@ -159,8 +158,7 @@ def _judged_on(tuned: Tuned, rows: Sequence[Row], given: JudgedOn | None) -> Jud
 
 def _units(tuned: Tuned) -> dict[str, str]:
     """The unit of each free parameter, by its name."""
-    every = tuned.model.units._replace(truth=TRUTH_UNITS)
-    units = dict(zip(leaf_names(every), jax.tree.leaves(every), strict=True))
+    units = leaves_by_name(tuned.model.units._replace(truth=TRUTH_UNITS))
     return {leaf.name: units[leaf.name] for leaf in tuned.layout.leaves}
 
 

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxekf._support.deprecations import warn_renamed
-from jaxekf.estimation.parameters import leaf_names
-from jaxekf.filtering.model import Parameters
+from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.recordings.types import Floats
 from tuning.results.comparison import Row, as_dicts, by_variant
 from tuning.results.fitted import Fitted
@@ -125,14 +123,14 @@ class CrossValidation:
     @property
     def parameters(self) -> dict[str, ParameterSpread]:
         """Free parameters over the folds by name; the fold's mean where each run has its own."""
-        first, found = self.folds[0].tuned, {}
-        values = [_by_name(fold.tuned.params) for fold in self.folds]
-        start = _by_name(first.start._replace(truth=()))
-        for name in (leaf.name for leaf in first.layout.leaves):
+        tuned, found = self.folds[0].tuned, {}
+        values = [leaves_by_name(fold.tuned.params) for fold in self.folds]
+        start = leaves_by_name(tuned.start._replace(truth=()))
+        for name in (leaf.name for leaf in tuned.layout.leaves):
             if name in start:
-                each = np.stack([value[name] for value in values])
-                deviation = each.std(axis=0, ddof=1)
-                found[name] = ParameterSpread(start[name], each.mean(axis=0), deviation, each)
+                each = np.stack([np.asarray(value[name], float) for value in values])
+                deviation, first = each.std(axis=0, ddof=1), np.asarray(start[name], float)
+                found[name] = ParameterSpread(first, each.mean(axis=0), deviation, each)
         return found
 
     def as_dict(self) -> dict[str, Any]:
@@ -171,8 +169,3 @@ def _spread(values: Sequence[float], column: str) -> Spread:
         badness = np.abs(np.log(array)) if column in _BEST_AT_ONE else array
     deviation = float(array.std(ddof=1)) if len(values) > 1 else nan
     return Spread(float(array.mean()), deviation, float(array[np.argmax(badness)]))
-
-
-def _by_name(params: Parameters) -> dict[str, Floats]:
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
-    return dict(zip(leaf_names(params), leaves, strict=True))

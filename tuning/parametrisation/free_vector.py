@@ -182,19 +182,17 @@ class Layout:
     @property
     def is_own(self) -> Any:
         """(n,) numbers that belong to one run only."""
-        return np.concatenate([np.full(leaf.size, leaf.runs > 0) for leaf in self.leaves])
+        return np.array([leaf.runs > 0 for leaf, _ in self.numbers()], bool)
 
     @property
     def is_truth(self) -> Any:
         """(n,) numbers that belong to the encoder."""
-        return np.concatenate(
-            [np.full(leaf.size, leaf.name.startswith("truth.")) for leaf in self.leaves]
-        )
+        return np.array([leaf.name.startswith("truth.") for leaf, _ in self.numbers()], bool)
 
     @property
     def is_logarithm(self) -> Any:
         """(n,) numbers that are logarithms."""
-        return np.array([leaf.is_logarithm(i) for leaf in self.leaves for i in range(leaf.size)])
+        return np.array([leaf.is_logarithm(i) for leaf, i in self.numbers()])
 
     @property
     def own_of_one_run(self) -> Any:
@@ -280,12 +278,15 @@ class Layout:
     def labels(self) -> list[str]:
         """A name for each free number."""
         names = []
-        for leaf in self.leaves:
-            for i in range(leaf.size):
-                run, entry = divmod(i, leaf.each)
-                name = leaf.name if leaf.each == 1 else f"{leaf.name}[{entry}]"
-                names.append(f"{name} of run {run}" if leaf.runs else name)
+        for leaf, i in self.numbers():
+            run, entry = divmod(i, leaf.each)
+            name = leaf.name if leaf.each == 1 else f"{leaf.name}[{entry}]"
+            names.append(f"{name} of run {run}" if leaf.runs else name)
         return names
+
+    def numbers(self) -> list[tuple[Leaf, int]]:
+        """Leaf of each free number, and the number's index in it."""
+        return [(leaf, i) for leaf in self.leaves for i in range(leaf.size)]
 
 
 def layout(

@@ -168,17 +168,9 @@ def tune(
     free: tuple[str, ...],
     own: tuple[str, ...],
     spec: Path | None,
-    axes: str | None,
     optimiser: str,
-    starts: int,
     batch: int | None,
-    seed: int,
-    iterations: int,
-    patience: int,
     burn_in: float,
-    rescale: bool | None,
-    smooth: bool,
-    confidence_intervals: bool,
     warm: bool | None,
     state: Path | None,
     folds: int | None,
@@ -187,6 +179,7 @@ def tune(
     output: Path,
     overwrite: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Tune on RUNS and write noise.toml, calibration.toml, and tuning.json for jaxekf report.
 
@@ -204,22 +197,15 @@ def tune(
     for run in training + validation if aim.needs_truth else ():
         if run.encoder is None:
             note(f"run '{run.name}' has no encoder and does not count in the error")
-    options: dict[str, Any] = {
+    # The others of `tuning.tune` have the names of their options: axes, starts, seed, iterations, ...
+    options |= {
         "validate": validation,
         "model": chosen,
         "objective": aim,
         "free": chosen_free or None,
         "start": start,
-        "axes": axes,
         "optimiser": from_name(optimiser, batch),
-        "starts": starts,
-        "seed": seed,
-        "iterations": iterations,
-        "patience": patience,
         "burn_in_s": burn_in,
-        "rescale": rescale,
-        "smooth": smooth,
-        "confidence_intervals": confidence_intervals,
         "warm": aim.errors_alone and optimiser != "adam" if warm is None else warm,
     }
     unseen = None
@@ -228,7 +214,10 @@ def tune(
         unseen = held_out(training, folds, **compared, **options)
         if not as_json:
             print_folds(unseen)
-    with memory.for_runs([run.name for run in training]), tuning_progress(iterations) as progress:
+    with (
+        memory.for_runs([run.name for run in training]),
+        tuning_progress(options["iterations"]) as progress,
+    ):
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuning.save(tuned, output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
@@ -236,7 +225,7 @@ def tune(
     _note(tuned, output)
     scored = [run for run in validation or training if run.encoder is not None]
     theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if validation else {}
-    rows = _compare(tuned, scored, start, theirs, smooth) if scored else []
+    rows = _compare(tuned, scored, start, theirs, options["smooth"]) if scored else []
     tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)

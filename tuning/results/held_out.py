@@ -1,7 +1,7 @@
 """Result of a cross-validation: folds, their spread, and the work that they took."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxekf._support.deprecations import warn_renamed
 from jaxekf.estimation.parameters import leaves_by_name
+from jaxekf.evaluation.spread import Spread, spread_of
 from jaxekf.recordings.types import Floats
 from tuning.results.comparison import Row, as_dicts, by_variant
 from tuning.results.fitted import Fitted
@@ -17,7 +18,6 @@ from tuning.results.searched import Searched
 from tuning.results.tuned import Tuned
 
 COLUMNS = tuple(name for name in Row._fields if name not in ("run", "variant"))
-_BEST_AT_ONE = ("nis", "nees", "position_nees")
 
 
 class Work(NamedTuple):
@@ -63,16 +63,6 @@ class Fold(NamedTuple):
         return {"start": Work(0.0, 0.0)} | {name: work_of(one) for name, one in every.items()}
 
 
-class Spread(NamedTuple):
-    """Statistics of a column over the runs that have a number there; NaN if there are too few."""
-
-    mean: float
-    deviation: float
-    """Standard deviation of a run, by n - 1."""
-    worst: float
-    """Largest error; for NIS and NEES the number farthest from 1 as a factor."""
-
-
 class ParameterSpread(NamedTuple):
     """Values of one parameter over the folds, in its unit."""
 
@@ -116,9 +106,8 @@ class CrossValidation:
 
     def spread(self, column: str = "attitude_rmse_deg") -> dict[str, Spread]:
         """Statistics of one of `COLUMNS` over the runs, by variant."""
-        return {
-            name: _spread(values, column) for name, values in by_variant(self.rows, column).items()
-        }
+        columns = by_variant(self.rows, column)
+        return {name: spread_of(values, column) for name, values in columns.items()}
 
     @property
     def parameters(self) -> dict[str, ParameterSpread]:
@@ -158,14 +147,3 @@ class CrossValidation:
                 },
             },
         }
-
-
-def _spread(values: Sequence[float], column: str) -> Spread:
-    nan = float("nan")
-    if not values:
-        return Spread(nan, nan, nan)
-    array = np.array(values)
-    with np.errstate(divide="ignore"):
-        badness = np.abs(np.log(array)) if column in _BEST_AT_ONE else array
-    deviation = float(array.std(ddof=1)) if len(values) > 1 else nan
-    return Spread(float(array.mean()), deviation, float(array[np.argmax(badness)]))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf.evaluation.spread import BEST_AT_ONE
 from jaxekf.io.documents.tuning import FreeNumber, RunScore, Step, TuningDocument
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
 from jaxekf.reporting.report._figures import Figure
@@ -19,7 +20,7 @@ from jaxekf.reporting.report._grid import (
     layout_name,
     panel_domain,
 )
-from jaxekf.reporting.report._tuned import BEST_AT_ONE, HELD, before_and_after, variants
+from jaxekf.reporting.report._tuned import HELD, before_and_after, variants
 
 _TOP, _BOTTOM, _ROW, _GAP = 40, 44, 180, 34
 _MOST_NUMBERS = 60

@@ -4,7 +4,6 @@ import datetime
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -111,8 +110,14 @@ def tune(
     learnt, validation = read(runs), read(validate)
     method = as_optimiser(optimiser, batch)
     aim = as_objective(objective, smooth=smooth)
-    problem = _problem(learnt, validation, model, aim, free, start, axes, burn_in_s)
-    make = partial(method.search, *problem, iterations, starts=starts, seed=seed)
+    chosen = adapted(get_model(model), [*learnt, *validation])
+    base = initial_parameters(chosen, start, free, axes)
+    where = layout(chosen, base, free, len(learnt))
+    _check(learnt, validation, where, aim)
+    groups = partial(prepare_groups, chosen, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
+    data = groups(learnt), groups(validation) if validation else None
+    problem = chosen, aim, where, base, *data, iterations
+    make = partial(method.search, *problem, starts=starts, seed=seed)
     searches = start_searches(make, starts, seed)
     if checkpoint is not None:
         limits = iterations, patience, burn_in_s, confidence_intervals, warm
@@ -126,25 +131,6 @@ def tune(
     if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
     return tuned
-
-
-def _problem(
-    learnt: list[Recording],
-    validation: list[Recording],
-    model: str | Model,
-    aim: Objective,
-    free: Sequence[str | Free] | None,
-    start: Parameters | None,
-    axes: str | None,
-    burn_in_s: float,
-) -> tuple[Any, ...]:
-    """The first six fields of a `Descent`."""
-    chosen = adapted(get_model(model), [*learnt, *validation])
-    base = initial_parameters(chosen, start, free, axes)
-    where = layout(chosen, base, free, len(learnt))
-    _check(learnt, validation, where, aim)
-    groups = partial(prepare_groups, chosen, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
-    return chosen, aim, where, base, groups(learnt), groups(validation) if validation else None
 
 
 def _finish(

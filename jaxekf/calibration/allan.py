@@ -196,7 +196,8 @@ def _regular(imu: Imu) -> tuple[float, Floats, int]:
     if missing:
         every = np.arange(number[-1] + 1)
         values = np.stack([np.interp(every, number, column) for column in values.T], axis=1)
-    return _period(times, int(number[-1])), values, missing
+    period = float(times[-1] - times[0]) / NANOSECONDS / int(number[-1])
+    return period, values, missing
 
 
 def _longest(steps: Times) -> tuple[int, int]:
@@ -206,7 +207,3 @@ def _longest(steps: Times) -> tuple[int, int]:
     cuts = np.concatenate([[-1], np.flatnonzero(lost > bound), [len(steps)]])
     longest = int(np.argmax(np.diff(cuts)))
     return int(cuts[longest]) + 1, int(cuts[longest + 1]) + 1
-
-
-def _period(times: Times, steps: int) -> float:
-    return float(times[-1] - times[0]) / NANOSECONDS / steps

@@ -309,17 +309,12 @@ def _run_interval(
     end = max(int(s.time_ns[-1]) for s in samples.values())
     if driver is not None:
         for name, stream in samples.items():
-            if stream.time_ns[0] > driver.time_ns[-1] or stream.time_ns[-1] < driver.time_ns[0]:
-                raise RecordingError(
-                    place,
-                    f"{name} over {_describe(stream.time_ns)} and the input"
-                    f" over {_describe(driver.time_ns)}",
-                    "streams that overlap in time",
-                    "checking the clocks and units of both",
-                )
+            _need_overlap(place, name, stream.time_ns, "the input", driver.time_ns)
         start, end = int(driver.time_ns[0]), int(driver.time_ns[-1])
-    elif model.hold_to is None and len(samples) > 1:
-        _check_overlap(place, samples)
+    elif model.hold_to is None:
+        first, *others = samples
+        for other in others:
+            _need_overlap(place, first, samples[first].time_ns, other, samples[other].time_ns)
     for name in model.start_with:
         stream = samples[name]
         seen = stream.time_ns[visible(stream) & (stream.time_ns >= start)]
@@ -345,17 +340,14 @@ def _run_interval(
     return start_sample.time_ns, end, start_sample
 
 
-def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
-    names = list(samples)
-    for other in names[1:]:
-        a, b = samples[names[0]].time_ns, samples[other].time_ns
-        if a[0] > b[-1] or a[-1] < b[0]:
-            raise RecordingError(
-                place,
-                f"{names[0]} over {_describe(a)} and {other} over {_describe(b)}",
-                "streams that overlap in time",
-                "checking the clocks and units of both",
-            )
+def _need_overlap(place: Any, name: str, times: Times, other: str, others: Times) -> None:
+    if times[0] > others[-1] or times[-1] < others[0]:
+        raise RecordingError(
+            place,
+            f"{name} over {_describe(times)} and {other} over {_describe(others)}",
+            "streams that overlap in time",
+            "checking the clocks and units of both",
+        )
 
 
 def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxekf.estimation.result import Estimated
 from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
-from jaxekf.recordings.types import Encoder, Flags, Floats, Optical, Recording, Times, to_scipy
+from jaxekf.recordings.types import Floats, Optical, Recording, Times, to_scipy
 
 
 class Score(NamedTuple):
@@ -145,29 +145,23 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
-    truth = encoder_at(recording.need_encoder(), estimate.time_ns)
-    judged = truth.scored & (estimate.time >= burn_in_s)
-    attitude = rate = nees = float("nan")
-    if "attitude" in estimate.outputs:
-        output = estimate.outputs["attitude"]
-        error = attitude_error(output.value[judged], truth.q_ref_body[judged])
-        attitude = float(np.rad2deg(rms(error)))
-        nees = mean_nees(error, output.cov[judged])
-    if "rate" in estimate.outputs:
-        true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
-        rate = float(np.rad2deg(rms(estimate.outputs["rate"].value[judged] - true_rate)))
-    where, where_nees = _position_score(estimate, truth, judged)
-    return Score(attitude, rate, nees, where, where_nees, int(judged.sum()))
+    judged = encoder_at(recording.need_encoder(), estimate.time_ns).scored
+    judged = judged & (estimate.time >= burn_in_s)
+    errors = scored_errors(estimate, recording)
 
+    def rmse(name: str) -> float:
+        return rms(errors[name][judged]) if name in errors else float("nan")
 
-def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple[float, float]:
-    """RMSE in mm and NEES of the position; a blank position of the encoder is ignored."""
-    if "position" not in estimate.outputs or truth.position is None:
-        return float("nan"), float("nan")
-    judged = judged & np.isfinite(truth.position).all(axis=1)
-    position = estimate.outputs["position"]
-    error = truth.position[judged] - position.value[judged]
-    return 1e3 * rms(error), mean_nees(error, position.cov[judged])
+    def nees(name: str) -> float:
+        if name not in errors:
+            return float("nan")
+        # A blank position of the encoder is ignored.
+        known = judged & np.isfinite(errors[name]).all(axis=1)
+        return mean_nees(errors[name][known], estimate.outputs[name].cov[known])
+
+    attitude, rate = (float(np.rad2deg(rmse(name))) for name in ("attitude", "rate"))
+    position = 1e3 * rmse("position"), nees("position")
+    return Score(attitude, rate, nees("attitude"), *position, int(judged.sum()))
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import leaf_names
+from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Recording
 from tuning.comparison.allan_only import allan_only
@@ -41,7 +41,7 @@ def by_allan(
 ) -> FittedParameters:
     """The start with the sensor noise of the runs' static intervals, or of a static log."""
     params = allan_only(model, start, runs, log).params
-    values = dict(zip(leaf_names(params), jax.tree.leaves(params), strict=True))
+    values = leaves_by_name(params)
     # Leaves of the encoder are left out: no held-out run has any for itself.
     leaves = [_as(leaf, values[leaf.name]) for leaf in layout.leaves if leaf.name in values]
     return FittedParameters(model, params, Layout(tuple(leaves)))

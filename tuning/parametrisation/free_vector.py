@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import as_arrays, leaf_names
+from jaxekf.estimation.parameters import as_arrays, leaf_names, leaves_by_name
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Floats
 from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
@@ -169,7 +169,7 @@ class Layout:
 
     def to_free(self, params: Parameters) -> Array:
         """The free vector (n,) of parameters."""
-        values = _by_name(params)
+        values = leaves_by_name(params)
         return jnp.concatenate(
             [leaf.to_free(jnp.asarray(values[leaf.name])) for leaf in self.leaves]
         )
@@ -182,19 +182,17 @@ class Layout:
     @property
     def is_own(self) -> Any:
         """(n,) numbers that belong to one run only."""
-        return np.concatenate([np.full(leaf.size, leaf.runs > 0) for leaf in self.leaves])
+        return np.array([leaf.runs > 0 for leaf, _ in self.numbers()], bool)
 
     @property
     def is_truth(self) -> Any:
         """(n,) numbers that belong to the encoder."""
-        return np.concatenate(
-            [np.full(leaf.size, leaf.name.startswith("truth.")) for leaf in self.leaves]
-        )
+        return np.array([leaf.name.startswith("truth.") for leaf, _ in self.numbers()], bool)
 
     @property
     def is_logarithm(self) -> Any:
         """(n,) numbers that are logarithms."""
-        return np.array([leaf.is_logarithm(i) for leaf in self.leaves for i in range(leaf.size)])
+        return np.array([leaf.is_logarithm(i) for leaf, i in self.numbers()])
 
     @property
     def own_of_one_run(self) -> Any:
@@ -242,7 +240,7 @@ class Layout:
             leaf[place]
             if name in self.own
             else jnp.broadcast_to(leaf, (len(place), *jnp.shape(leaf)))
-            for name, leaf in _by_name(shared).items()
+            for name, leaf in leaves_by_name(shared).items()
         ]
         every = jax.tree.unflatten(jax.tree.structure(shared), leaves)
         return every._replace(setup=setup)
@@ -250,7 +248,8 @@ class Layout:
     def one_run(self, params: Parameters, place: int) -> Parameters:
         """The parameters of one run."""
         leaves = [
-            leaf[place] if name in self.own else leaf for name, leaf in _by_name(params).items()
+            leaf[place] if name in self.own else leaf
+            for name, leaf in leaves_by_name(params).items()
         ]
         return jax.tree.unflatten(jax.tree.structure(params), leaves)
 
@@ -258,7 +257,7 @@ class Layout:
         """One set for another run: the mean of the runs' own parameters, of logarithms for deviations."""
         kinds = {leaf.name: leaf for leaf in self.leaves if leaf.runs}
         leaves = []
-        for name, value in _by_name(params).items():
+        for name, value in leaves_by_name(params).items():
             if name in kinds:
                 leaf = kinds[name]
                 middle = leaf.to_free(value).reshape(leaf.runs, leaf.each).mean(axis=0)
@@ -273,22 +272,21 @@ class Layout:
         for leaf in self.leaves:
             changed[leaf.name] = leaf.from_free(free[start : start + leaf.size])
             start += leaf.size
-        values = [changed.get(name, value) for name, value in _by_name(base).items()]
+        values = [changed.get(name, value) for name, value in leaves_by_name(base).items()]
         return jax.tree.unflatten(jax.tree.structure(base), values)
 
     def labels(self) -> list[str]:
         """A name for each free number."""
         names = []
-        for leaf in self.leaves:
-            for i in range(leaf.size):
-                run, entry = divmod(i, leaf.each)
-                name = leaf.name if leaf.each == 1 else f"{leaf.name}[{entry}]"
-                names.append(f"{name} of run {run}" if leaf.runs else name)
+        for leaf, i in self.numbers():
+            run, entry = divmod(i, leaf.each)
+            name = leaf.name if leaf.each == 1 else f"{leaf.name}[{entry}]"
+            names.append(f"{name} of run {run}" if leaf.runs else name)
         return names
 
-
-def _by_name(params: Parameters) -> dict[str, Any]:
-    return dict(zip(leaf_names(params), jax.tree.leaves(params), strict=True))
+    def numbers(self) -> list[tuple[Leaf, int]]:
+        """Leaf of each free number, and the number's index in it."""
+        return [(leaf, i) for leaf in self.leaves for i in range(leaf.size)]
 
 
 def layout(
@@ -304,8 +302,8 @@ def layout(
     parameters of their own. Raises `TuningError` for an unknown name, a start outside its domain or
     bounds, and an invalid prior or bounds.
     """
-    values = _by_name(params)
-    units = _by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
+    values = leaves_by_name(params)
+    units = leaves_by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
     wanted = ["noise"] if free is None else list(free)
     if not wanted:
         raise TuningError(

@@ -1,17 +1,16 @@
 """Result of a cross-validation: folds, their spread, and the work that they took."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxekf._support.deprecations import warn_renamed
-from jaxekf.estimation.parameters import leaf_names
-from jaxekf.filtering.model import Parameters
+from jaxekf.estimation.parameters import leaves_by_name
+from jaxekf.evaluation.spread import Spread, spread_of
 from jaxekf.recordings.types import Floats
 from tuning.results.comparison import Row, as_dicts, by_variant
 from tuning.results.fitted import Fitted
@@ -19,7 +18,6 @@ from tuning.results.searched import Searched
 from tuning.results.tuned import Tuned
 
 COLUMNS = tuple(name for name in Row._fields if name not in ("run", "variant"))
-_BEST_AT_ONE = ("nis", "nees", "position_nees")
 
 
 class Work(NamedTuple):
@@ -65,16 +63,6 @@ class Fold(NamedTuple):
         return {"start": Work(0.0, 0.0)} | {name: work_of(one) for name, one in every.items()}
 
 
-class Spread(NamedTuple):
-    """Statistics of a column over the runs that have a number there; NaN if there are too few."""
-
-    mean: float
-    deviation: float
-    """Standard deviation of a run, by n - 1."""
-    worst: float
-    """Largest error; for NIS and NEES the number farthest from 1 as a factor."""
-
-
 class ParameterSpread(NamedTuple):
     """Values of one parameter over the folds, in its unit."""
 
@@ -118,21 +106,20 @@ class CrossValidation:
 
     def spread(self, column: str = "attitude_rmse_deg") -> dict[str, Spread]:
         """Statistics of one of `COLUMNS` over the runs, by variant."""
-        return {
-            name: _spread(values, column) for name, values in by_variant(self.rows, column).items()
-        }
+        columns = by_variant(self.rows, column)
+        return {name: spread_of(values, column) for name, values in columns.items()}
 
     @property
     def parameters(self) -> dict[str, ParameterSpread]:
         """Free parameters over the folds by name; the fold's mean where each run has its own."""
-        first, found = self.folds[0].tuned, {}
-        values = [_by_name(fold.tuned.params) for fold in self.folds]
-        start = _by_name(first.start._replace(truth=()))
-        for name in (leaf.name for leaf in first.layout.leaves):
+        tuned, found = self.folds[0].tuned, {}
+        values = [leaves_by_name(fold.tuned.params) for fold in self.folds]
+        start = leaves_by_name(tuned.start._replace(truth=()))
+        for name in (leaf.name for leaf in tuned.layout.leaves):
             if name in start:
-                each = np.stack([value[name] for value in values])
-                deviation = each.std(axis=0, ddof=1)
-                found[name] = ParameterSpread(start[name], each.mean(axis=0), deviation, each)
+                each = np.stack([np.asarray(value[name], float) for value in values])
+                deviation, first = each.std(axis=0, ddof=1), np.asarray(start[name], float)
+                found[name] = ParameterSpread(first, each.mean(axis=0), deviation, each)
         return found
 
     def as_dict(self) -> dict[str, Any]:
@@ -160,19 +147,3 @@ class CrossValidation:
                 },
             },
         }
-
-
-def _spread(values: Sequence[float], column: str) -> Spread:
-    nan = float("nan")
-    if not values:
-        return Spread(nan, nan, nan)
-    array = np.array(values)
-    with np.errstate(divide="ignore"):
-        badness = np.abs(np.log(array)) if column in _BEST_AT_ONE else array
-    deviation = float(array.std(ddof=1)) if len(values) > 1 else nan
-    return Spread(float(array.mean()), deviation, float(array[np.argmax(badness)]))
-
-
-def _by_name(params: Parameters) -> dict[str, Floats]:
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
-    return dict(zip(leaf_names(params), leaves, strict=True))

@@ -121,16 +121,18 @@ class Tuned:
     def moved(self) -> list[str]:
         """Change of each free number from its start, in words: the factor of a logarithm, else in prior
         standard deviations."""
-        start = np.asarray(self.layout.to_free(self.start))
-        found, at = [], 0
-        for leaf in self.layout.leaves:
-            for i in range(leaf.size):
-                change = leaf.unbounded(self.free[at], i) - leaf.unbounded(start[at], i)
-                if leaf.is_logarithm(i):
-                    found.append(f"x {np.exp(change):.3g}")
-                else:
-                    found.append(f"{change / leaf.prior:+.2g} prior sigma")
-                at += 1
+        return [
+            f"x {change:.3g}" if leaf.is_logarithm(i) else f"{change:+.2g} prior sigma"
+            for (leaf, i), change in zip(self.layout.numbers(), self.changes, strict=True)
+        ]
+
+    @property
+    def changes(self) -> list[float]:
+        """Change of each free number from its start: a factor of a logarithm, else in prior deviations."""
+        start, found = np.asarray(self.layout.to_free(self.start)), []
+        for (leaf, i), first, last in zip(self.layout.numbers(), start, self.free, strict=True):
+            change = leaf.unbounded(last, i) - leaf.unbounded(first, i)
+            found.append(float(np.exp(change)) if leaf.is_logarithm(i) else change / leaf.prior)
         return found
 
     def of_run(self, run: Run) -> Parameters:

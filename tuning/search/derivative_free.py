@@ -156,7 +156,7 @@ class Problem:
     @property
     def steps(self) -> Floats:
         """(n,) first steps; the free numbers of calibration are in its natural unit."""
-        linear = [leaf.kind == "linear" for leaf in self.layout.leaves for _ in range(leaf.size)]
+        linear = [leaf.kind == "linear" for leaf, _ in self.layout.numbers()]
         return np.where(linear, 1.0, _FIRST_STEP)
 
     def by_coordinates(self, sweeps: int) -> Found:

@@ -24,14 +24,8 @@ class JaxekfError(Exception):
 class RecordingError(JaxekfError):
     """A recorded run cannot be read, or its data do not fit its description.
 
-    Attributes
-    ----------
-    path
-        The file, the folder, or the name of a run in memory.
-    line
-        Line of the file, from 1 on; None if it is not about one line.
-    column
-        Name of the column of a table, or of an entry of `recording.toml`; None if it is not about one.
+    The error has the place: ``path`` is the file, the folder, or the name of a run in memory; ``line``
+    (from 1 on) and ``column`` (or entry of `recording.toml`) are None if it is not about one.
 
     Examples
     --------

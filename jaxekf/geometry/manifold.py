@@ -183,6 +183,7 @@ class SO3(Manifold):
     """
 
     unit: str = "rad"
+    """Unit of the error vector."""
 
     @property
     def dim(self) -> int:
@@ -236,6 +237,7 @@ class AdditiveQuaternion(Manifold):
     """
 
     unit: str = ""
+    """Unit of the error vector; none."""
 
     @property
     def dim(self) -> int:

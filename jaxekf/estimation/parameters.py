@@ -95,6 +95,19 @@ def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str
     ------
     ModelError
         A standard deviation is not positive and finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaxekf.save_parameters(folder, model, model.parameters, {"by": "hand"})
+    ...     lines = Path(folder, "noise.toml").read_text().splitlines()
+    >>> at = lines.index("[noise.optical]")
+    >>> print("; ".join(lines[at : at + 4]))
+    [noise.optical]; value = 0.005235987755982988; unit = "rad"; value_deg = 0.3
     """
     save_noise(path, model, params, origin)
     if leaf_names(params.calibration):
@@ -167,6 +180,18 @@ def load(model: str | Model, *paths: Path | str) -> Parameters:
         A file is missing, is not TOML, or has other entries, units or shapes than the model.
     ModelError
         A file is of another model, or a standard deviation is not positive and finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> noise = model.parameters.noise._replace(optical=0.004)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaxekf.save_parameters(folder, model, model.parameters._replace(noise=noise), {})
+    ...     params = jaxekf.load_parameters("loose", folder)
+    >>> print(f"{params.noise.optical:.3f} rad")
+    0.004 rad
     """
     model = get_model(model)
     params = model.parameters

@@ -39,14 +39,33 @@ _Finding = tuple[str, str]
 
 @dataclass(frozen=True)
 class Fault:
-    """A systematic error found in the innovations of an attitude."""
+    """A systematic error found in the innovations of an attitude.
+
+    Examples
+    --------
+    The tracker's stamps are 20 ms late:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> fault = jaxekf.diagnose(jaxekf.estimate(late)).sensors["optical"].faults[0]
+    >>> print(f"{fault.kind} {fault.size[0]:.2f} {fault.unit}, {fault.effect:.0f} times the noise")
+    latency 0.02 s, 3 times the noise
+    >>> fault.p < 1e-8
+    True
+    """
 
     kind: str
     """`latency`, `gyroscope_bias` or `gyroscope_matrix`."""
     size: tuple[float, ...]
     """Latency in s; bias error in rad/s; or gyroscope matrix minus the assumed one, by rows."""
     sigma: tuple[float, ...]
+    """Standard deviation of each component of `size`."""
     unit: str
+    """Unit of `size`: s, rad/s or 1."""
     p: float
     """P-value of the hypothesis that there is no fault."""
     effect: float
@@ -55,7 +74,24 @@ class Fault:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One inconsistency, for a program and for a person."""
+    """One inconsistency, for a program and for a person.
+
+    Examples
+    --------
+    The tracker's stamps are 20 ms late:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> verdict = jaxekf.diagnose(jaxekf.estimate(late)).verdicts[0]
+    >>> print(f"{verdict.about}: {verdict.kind} of {verdict.size:.2f} {verdict.unit}")
+    optical: latency of 0.02 s
+    >>> print(str(verdict).partition("; ")[2])
+    set the latency in recording.toml, or tune the calibration's clock offset or latency
+    """
 
     kind: str
     """`noise_too_small`, `noise_too_large`, `process_noise_too_large`, `outliers`, `correlated`, `biased`,
@@ -67,6 +103,7 @@ class Verdict:
     size: float | None
     """Size of the fault in `unit`; None for a verdict without one."""
     unit: str
+    """Unit of `size`; empty for a verdict without one."""
     sentence: str
     """The finding and its likely cause."""
 

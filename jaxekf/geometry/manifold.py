@@ -25,6 +25,22 @@ class Manifold(ABC):
     """One part of a state: its storage, its error vector and its names.
 
     A new manifold defines the abstract members; the derivatives have defaults by autodiff.
+
+    Examples
+    --------
+    An angle, whose error is the shorter way around the circle:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> class Angle(jaxekf.Manifold):
+    ...     unit, dim, shape, curved = "rad", 1, (1,), False
+    ...     component_labels = error_labels = ("",)
+    ...     def retract(self, x, delta):
+    ...         return x + delta
+    ...     def local(self, x, y):
+    ...         return (y - x + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
+    >>> print(f"{Angle().local(jnp.array([3.1]), jnp.array([-3.1]))[0]:.2f} rad")
+    0.08 rad
     """
 
     unit: str
@@ -107,12 +123,33 @@ class _Additive(Manifold):
 
 @dataclass(frozen=True)
 class Euclidean(_Additive):
-    """A vector of `size` components with additive error."""
+    """A vector of `size` components with additive error.
+
+    Examples
+    --------
+    A state of attitude and two magnetometer offsets, and the rows of its covariance:
+
+    >>> from typing import Any, NamedTuple
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> class State(NamedTuple):
+    ...     q_ref_body: Any
+    ...     offset: Any
+    >>> space = State(jaxekf.SO3(), jaxekf.Euclidean(2, "uT", labels=("x", "y")))
+    >>> manifold.error_labels(space)
+    ('q_ref_body_x', 'q_ref_body_y', 'q_ref_body_z', 'offset_x', 'offset_y')
+    >>> manifold.error_units(space)
+    ('rad', 'rad', 'rad', 'uT', 'uT')
+    """
 
     size: int
+    """Number of components."""
     unit: str = ""
+    """Unit of all components."""
     labels: tuple[str, ...] = ()
+    """Label of each component; by default x, y, z for three, else their numbers."""
     frame: str = "body"
+    """Frame of the vector and of its error."""
 
     @property
     def dim(self) -> int:
@@ -134,9 +171,23 @@ class Euclidean(_Additive):
 
 @dataclass(frozen=True)
 class SO3(Manifold):
-    """A rotation stored as a unit quaternion w, x, y, z; the error is a body-frame rotation vector."""
+    """A rotation stored as a unit quaternion w, x, y, z; the error is a body-frame rotation vector.
+
+    Examples
+    --------
+    A quarter turn about z as an error of three components, and back:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> space = jaxekf.SO3()
+    >>> start = jnp.array([1.0, 0.0, 0.0, 0.0])
+    >>> turned = space.retract(start, jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> print(turned.round(2), jnp.rad2deg(space.local(start, turned)).round(1))
+    [0.71 0.   0.   0.71] [ 0.  0. 90.]
+    """
 
     unit: str = "rad"
+    """Unit of the error vector."""
 
     @property
     def dim(self) -> int:
@@ -176,9 +227,21 @@ class AdditiveQuaternion(_Additive):
 
     Both signs of a quaternion are the same rotation, so `local` takes the sign of ``y`` nearer to
     ``x``. The norm is not constrained here; the model's `project` normalises it.
+
+    Examples
+    --------
+    Both signs of a quaternion have no difference:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> space = jaxekf.AdditiveQuaternion()
+    >>> q = jnp.array([0.6, 0.8, 0.0, 0.0])
+    >>> space.dim, bool((space.local(q, -q) == 0.0).all())
+    (4, True)
     """
 
     unit: str = ""
+    """Unit of the error vector; none."""
 
     @property
     def dim(self) -> int:

@@ -135,6 +135,19 @@ def read_export(path: Path | str) -> dict[str, Any]:
     ------
     RecordingError
         For a file that `Estimate.export` has not written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     found = jaxekf.read_export(estimate.export(folder + "/estimate.npz"))
+    >>> found["model"], found["state/bias"].shape, found["state/bias@unit"]
+    ('loose', (3001, 3), 'rad/s')
+    >>> bool((found["time_ns"] == estimate.time_ns).all())
+    True
     """
     form = format_of(path)
     if form not in ("npz", "hdf5"):

@@ -60,8 +60,9 @@ class Factors(NamedTuple):
 
     Examples
     --------
-    >>> import jax, numpy as np
+    >>> import jax, jaxekf, numpy as np
     >>> from jaxekf.geometry import quadratic_least_squares
+    >>> jaxekf.set_up()
     >>> flat = np.diag([1.0, 2.0, 0.0])  # nothing depends on the third number
     >>> factors = jax.jit(quadratic_least_squares.orthogonalise)(flat, np.ones(3))
     >>> bool(factors.weak), np.diagonal(factors.inverse).round(5).tolist()

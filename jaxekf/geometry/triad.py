@@ -73,8 +73,9 @@ def north_west_up(dip: Array | float) -> References:
 
     Examples
     --------
-    >>> import numpy as np
+    >>> import jaxekf, numpy as np
     >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
     >>> field = np.asarray(triad.north_west_up(np.deg2rad(60.0)).field)
     >>> field.round(4).tolist()  # to the north and down
     [0.5, 0.0, -0.866]
@@ -96,8 +97,9 @@ def east_north_up(dip: Array | float, declination: Array | float = 0.0) -> Refer
 
     Examples
     --------
-    >>> import numpy as np
+    >>> import jaxekf, numpy as np
     >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
     >>> east_of_north = triad.east_north_up(np.deg2rad(60.0), np.deg2rad(30.0))
     >>> np.asarray(east_of_north.field).round(4).tolist()  # to the north-north-east and down
     [0.25, 0.433, -0.866]

@@ -50,7 +50,9 @@ class Data(NamedTuple):
     setup: Any
     """`Parameters.setup` of each run."""
     steps: Steps
+    """Time steps and measurements, leading axes (runs, K, S)."""
     truth: dict[str, Truth]
+    """Truth of each output by its name; empty for a model without any of them."""
     counted: Any
     """(runs, K, S) instants past the burn-in, at which the likelihood counts."""
     place: Any

@@ -89,14 +89,18 @@ class Tuned:
     params: Parameters
     """Best parameters, by validation if there is one; the mean over the runs where each run has its own."""
     start: Parameters
+    """Initial parameters, in the shapes that were tuned."""
     objective: Objective
     best: Iteration
+    """Iteration whose parameters were chosen."""
     history: tuple[Iteration, ...]
+    """All iterations, in order."""
     stopped: str
     """Reason for the end of the search, in words."""
     scale: float
     """Factor on all covariances after the fit, so that the errors match them."""
     layout: Layout
+    """Free parameters, and their order in `free`."""
     origin: dict[str, Any] = field(default_factory=dict)
     each: dict[str, Parameters] = field(default_factory=dict)
     """Parameters of each training run by its name, if runs have parameters of their own."""

@@ -1,6 +1,7 @@
 """The manual's sources: public names, links, and the length of the README. CI builds it, see `.ci/run`."""
 
 import importlib
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -22,6 +23,28 @@ def test_public_names_are_in_the_reference(package):
     found = re.findall(rf"^\.\. auto\w+:: {package.__name__}\.(\w+)$", page, re.M)
     assert sorted(found) == sorted(package.__all__)
     assert all(hasattr(package, name) for name in found)
+
+
+@pytest.mark.parametrize(
+    "package", [jaxekf, jaxekf.timeline, tuning], ids=lambda package: package.__name__
+)
+def test_public_names_have_an_example(package):
+    """Would catch a public function or class without an example in its own docstring, a new one too."""
+    names = getattr(package, "__all__", None) or [
+        name
+        for name, value in vars(package).items()
+        if not name.startswith("_") and getattr(value, "__module__", "") == package.__name__
+    ]
+    public = {name: getattr(package, name) for name in names}
+    # An inherited docstring is of another class.
+    documented = {
+        name: vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+        for name, value in public.items()
+        if inspect.isclass(value) or inspect.isroutine(value)
+    }
+    assert documented
+    lacking = sorted(name for name, text in documented.items() if ">>>" not in (text or ""))
+    assert not lacking, f"no example in {package.__name__}: {', '.join(lacking)}"
 
 
 def test_public_modules_are_in_the_reference(tmp_path, monkeypatch):

@@ -41,6 +41,21 @@ def keep_programs(folder: Path | str | None = None) -> Path:
     ------
     CacheError
         The folder cannot be written; JAX's settings are then unchanged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jax
+    >>> from jax.experimental.compilation_cache import compilation_cache
+    >>> import jaxekf
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     place = jaxekf.keep_programs(folder)
+    ...     result = jaxekf.jit(lambda x: 2.0 * x)(1.0)
+    ...     kept = list(place.iterdir())
+    ...     jax.config.update("jax_compilation_cache_dir", None)  # keep no more
+    ...     compilation_cache.reset_cache()
+    >>> len(kept) > 0
+    True
     """
     place = Path(default_folder() if folder is None else folder).expanduser().absolute()
     place = place / f"jaxlib-{version('jaxlib')}-{processor()}"

@@ -141,7 +141,17 @@ def averaging_lengths(count: int) -> Floats:
 
 
 def overlapping_deviation(values: Floats, lengths: Floats) -> Floats:
-    """Overlapping Allan deviation (T,) of samples (n,) at averaging lengths (T,), in samples."""
+    """Overlapping Allan deviation (T,) of samples (n,) at averaging lengths (T,), in samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.calibration import allan
+    >>> white = np.random.default_rng(1).standard_normal(100_000)
+    >>> deviation = allan.overlapping_deviation(white, np.array([1, 100]))
+    >>> bool(abs(deviation[0] / deviation[1] - 10.0) < 0.5)  # falls with the root of the time
+    True
+    """
     total = np.concatenate([[0.0], np.cumsum(values - np.mean(values))])
     found = np.empty(len(lengths))
     for i, m in enumerate(lengths.astype(int)):
@@ -196,7 +206,8 @@ def _regular(imu: Imu) -> tuple[float, Floats, int]:
     if missing:
         every = np.arange(number[-1] + 1)
         values = np.stack([np.interp(every, number, column) for column in values.T], axis=1)
-    return _period(times, int(number[-1])), values, missing
+    period = float(times[-1] - times[0]) / NANOSECONDS / int(number[-1])
+    return period, values, missing
 
 
 def _longest(steps: Times) -> tuple[int, int]:
@@ -206,7 +217,3 @@ def _longest(steps: Times) -> tuple[int, int]:
     cuts = np.concatenate([[-1], np.flatnonzero(lost > bound), [len(steps)]])
     longest = int(np.argmax(np.diff(cuts)))
     return int(cuts[longest]) + 1, int(cuts[longest + 1]) + 1
-
-
-def _period(times: Times, steps: int) -> float:
-    return float(times[-1] - times[0]) / NANOSECONDS / steps

@@ -78,6 +78,13 @@ def static_head(recording: Recording) -> float:
     ------
     RecordingError
         If the interval is shorter than 3 s, or if the tracker rotates steadily during it.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.calibration import static_interval
+    >>> round(static_interval.static_head(jaxekf.load(jaxekf.demo.FOLDER / "constant-rate")))  # s
+    6
     """
     place = str(recording.path or recording.name)
     imu = recording.need_imu()
@@ -126,13 +133,8 @@ def cut_imu(imu: Imu, begin_s: float, end_s: float) -> Imu:
     """The samples from `begin_s` to `end_s`, seconds after the first."""
     t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     chosen = (t >= begin_s) & (t <= end_s)
-    return replace(
-        imu,
-        time_ns=imu.time_ns[chosen],
-        gyroscope=imu.gyroscope[chosen],
-        accelerometer=None if imu.accelerometer is None else imu.accelerometer[chosen],
-        magnetometer=None if imu.magnetometer is None else imu.magnetometer[chosen],
-    )
+    columns = {name: getattr(imu, name) for name in ("time_ns", *imu.per_sample)}
+    return replace(imu, **{k: None if v is None else v[chosen] for k, v in columns.items()})
 
 
 def tracker_noise(

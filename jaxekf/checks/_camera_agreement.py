@@ -103,15 +103,7 @@ def _select_images(camera: Camera, images: Flags) -> Camera:
 def _middle_images(camera: Camera) -> Camera:
     """Consecutive images from the middle of the run, few enough to be solved in seconds."""
     begin = max(0, (len(camera.time_ns) - _MOST_IMAGES) // 2)
-    part = slice(begin, begin + _MOST_IMAGES)
-    sigma = None if camera.sigma is None else camera.sigma[part]
-    return replace(
-        camera,
-        time_ns=camera.time_ns[part],
-        pixel=camera.pixel[part],
-        visible=camera.visible[part],
-        sigma=sigma,
-    )
+    return camera.take(slice(begin, begin + _MOST_IMAGES))
 
 
 def check_camera(recording: Recording, found: CameraEvidence) -> None:

@@ -221,12 +221,9 @@ def _no_overlap(recording: Recording, found: Evidence, label: str) -> RecordingE
         f"{name} from {_seconds(found.ranges_s[name][0])} to {_seconds(found.ranges_s[name][1])} s"
         for name in (label, "imu")
     ]
-    return RecordingError(
-        recording.path or recording.name,
-        " and ".join(words),
-        "streams that overlap in time",
-        "putting both on one clock, or the IMU's log of the same run",
-    )
+    expected = "streams that overlap in time"
+    hint = "putting both on one clock, or the IMU's log of the same run"
+    return RecordingError(recording.path or recording.name, " and ".join(words), expected, hint)
 
 
 def _check_truth(recording: Recording) -> None:
@@ -242,12 +239,10 @@ def _check_truth(recording: Recording) -> None:
         return
     ends = (truth.time_ns[0], truth.time_ns[-1], first, last)
     a, b, c, d = (_seconds(1e-9 * t) for t in ends)
-    raise RecordingError(
-        recording.path or recording.name,
-        f"encoder from {a} to {b} s and the other streams from {c} to {d} s",
-        "streams that overlap in time",
-        "putting them on one clock, or stating the unit of its times (time_unit)",
-    )
+    got = f"encoder from {a} to {b} s and the other streams from {c} to {d} s"
+    expected = "streams that overlap in time"
+    hint = "putting them on one clock, or stating the unit of its times (time_unit)"
+    raise RecordingError(recording.path or recording.name, got, expected, hint)
 
 
 def _seconds(value: float) -> str:

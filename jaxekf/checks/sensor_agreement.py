@@ -15,15 +15,7 @@ from jaxekf.calibration.motion_agreement import MotionFit, RelativeRotations
 from jaxekf.pose_solvers.marker_pose import from_markers
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.facts import BODY_TO_REFERENCE
-from jaxekf.recordings.types import (
-    NANOSECONDS,
-    Floats,
-    Imu,
-    Markers,
-    Optical,
-    Recording,
-    Times,
-)
+from jaxekf.recordings.types import NANOSECONDS, Floats, Imu, Markers, Optical, Recording
 
 ALIKE = 0.8
 """Correlation from which on both streams measure the same motion, so that their ratio is meaningful."""
@@ -173,34 +165,17 @@ def tracker_label(recording: Recording) -> str:
 
 
 def _rotations(tracker: Optical | Markers, imu: Imu) -> RelativeRotations | None:
-    if isinstance(tracker, Optical):
-        rows = np.flatnonzero(tracker.valid)
-        t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
-        return motion_agreement.relative_rotations(
-            t, lambda chosen: tracker.q_ref_body[rows[chosen]], imu
-        )
-    rows = np.flatnonzero(tracker.usable.sum(axis=1) >= 3)
-    t = _seconds_since_imu_start(tracker.time_ns[rows] - tracker.latency_ns, imu)
+    posed = isinstance(tracker, Optical)
+    rows = np.flatnonzero(tracker.valid if posed else tracker.usable.sum(axis=1) >= 3)
+    t = (tracker.time_ns[rows] - tracker.latency_ns - imu.time_ns[0]) / NANOSECONDS
 
     def attitude(chosen: Indices) -> Floats:
-        return from_markers(select_frames(tracker, rows[chosen])).q_ref_body
+        if isinstance(tracker, Optical):
+            return tracker.q_ref_body[rows[chosen]]
+        return from_markers(tracker.take(rows[chosen])).q_ref_body
 
-    return motion_agreement.relative_rotations(t, attitude, imu, _MARKER_PAIRS)
-
-
-def _seconds_since_imu_start(time_ns: Times, imu: Imu) -> Floats:
-    return (time_ns - imu.time_ns[0]) / NANOSECONDS
-
-
-def select_frames(markers: Markers, rows: Indices) -> Markers:
-    """Some frames of single markers, unusable markers hidden."""
-    return Markers(
-        markers.time_ns[rows],
-        markers.position[rows],
-        markers.usable[rows],
-        markers.names,
-        markers.p_body_marker,
-    )
+    pairs = {} if posed else {"most": _MARKER_PAIRS}
+    return motion_agreement.relative_rotations(t, attitude, imu, **pairs)
 
 
 def _other_readings(recording: Recording) -> dict[str, motion_agreement.QuaternionReading]:

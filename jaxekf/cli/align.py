@@ -19,6 +19,7 @@ from jaxekf.cli.console import (
     json_option,
     model_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -39,9 +40,7 @@ from jaxekf.recordings.types import Floats
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @model_option
 @sort_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), default=Path("aligned"), show_default=True
-)
+@output_option("aligned")
 @overwrite_option
 @json_option
 def align(
@@ -88,9 +87,7 @@ def align(
 def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:
     rows = []
     for run in found:
-        rows.append(aligned_row(run.run, "tracker", run.tracker))
-        if run.encoder is not None:
-            rows.append(aligned_row(run.run, "encoder", run.encoder))
+        rows += aligned_rows(run)
     if len(found) > 1:
         size, axis, sigma = _turn(mean.alignment, mean.alignment_cov)
         latency = _pm(1e3 * mean.latency_s, 1e3 * mean.latency_sigma_s)
@@ -115,6 +112,14 @@ def alignment_columns() -> list[str]:
         "alignment\n(deg)",
         "about\n(x, y, z)",
         "gyroscope bias\n(deg/s)",
+    ]
+
+
+def aligned_rows(found: RunAlignment) -> list[list[Any]]:
+    """The tracker and, if there is one, the encoder of a run."""
+    streams = {"tracker": found.tracker, "encoder": found.encoder}
+    return [
+        aligned_row(found.run, name, made) for name, made in streams.items() if made is not None
     ]
 
 

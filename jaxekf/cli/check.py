@@ -11,7 +11,13 @@ import numpy as np
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks.inspection import Inspection, StreamSummary, inspect
 from jaxekf.checks.sensor_agreement import Evidence
-from jaxekf.cli.align import aligned_row, alignment_columns, match_document, run_document
+from jaxekf.cli.align import (
+    aligned_row,
+    aligned_rows,
+    alignment_columns,
+    match_document,
+    run_document,
+)
 from jaxekf.cli.console import (
     json_option,
     note,
@@ -182,11 +188,7 @@ def _row(label: str, stream: StreamSummary) -> list[Any]:
 
 def _aligned(found: Inspection) -> list[list[Any]]:
     """Rows of clock and frame against the IMU."""
-    rows, made = [], found.alignment
-    if made is not None:
-        rows.append(aligned_row(found.run, "tracker", made.tracker))
-        if made.encoder is not None:
-            rows.append(aligned_row(found.run, "encoder", made.encoder))
+    rows = [] if found.alignment is None else aligned_rows(found.alignment)
     if found.camera is not None and found.camera.match is not None:
         rows.append(aligned_row(found.run, "camera", found.camera.match))
     return rows

@@ -4,18 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 
 import tuning
 from jaxekf.cli.console import print_table
-from jaxekf.estimation.parameters import leaf_names
-from jaxekf.filtering.model import Model
-
-
-def units_by_name(model: Model) -> dict[str, str]:
-    """The unit of each parameter."""
-    return dict(zip(leaf_names(model.units), jax.tree.leaves(model.units), strict=True))
 
 
 def in_degrees(unit: str) -> tuple[Callable[[Any], Any], str]:

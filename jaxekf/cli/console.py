@@ -19,17 +19,20 @@ from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
 from jaxekf.models.robust import OUTLIER_METHODS
 
+
+def default_option(name: str, kind: Any, default: Any, contents: str) -> Callable[[Any], Any]:
+    """An option with a default, which its help shows after `contents`."""
+    return click.option(name, type=kind, default=default, show_default=True, help=contents)
+
+
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="JSON on standard output instead of a table."
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replacement of an existing output."
 )
-model_option = click.option(
-    "--model",
-    default="loose",
-    show_default=True,
-    help=f"Model: {', '.join(REGISTRY)}, or your own as module:attribute.",
+model_option = default_option(
+    "--model", None, "loose", f"Model: {', '.join(REGISTRY)}, or your own as module:attribute."
 )
 noise_option = click.option(
     "--noise",
@@ -54,16 +57,10 @@ robust_option = click.option(
 )
 
 
-def output_option(default: str, contents: str) -> Callable[[Any], Any]:
+def output_option(default: str, contents: str | None = None) -> Callable[[Any], Any]:
     """The option ``-o``: a path with its default, and the noun phrase of its help."""
-    return click.option(
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path),
-        default=Path(default),
-        show_default=True,
-        help=contents,
-    )
+    names, kind = ("-o", "--output"), click.Path(path_type=Path)
+    return click.option(*names, type=kind, default=Path(default), show_default=True, help=contents)
 
 
 def wrote(path: Path) -> None:

@@ -142,11 +142,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     help="Causal estimates at each IMU sample, from measurements that had arrived after the tracker's"
     " latency, as in a live system; for models with an input.",
 )
-@click.option(
-    "--smooth",
-    is_flag=True,
-    help="Smoothed estimates: each instant from the whole run.",
-)
+@click.option("--smooth", is_flag=True, help="Smoothed estimates: each instant from the whole run.")
 @click.option(
     "--export",
     "exports",

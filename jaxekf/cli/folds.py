@@ -9,8 +9,9 @@ import click
 import numpy as np
 
 import tuning
-from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
+from jaxekf.cli.comparison import in_degrees, print_comparison, short
 from jaxekf.cli.console import note, print_table, tuning_progress
+from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.io.run_folder import read_log
 from jaxekf.recordings.types import Recording
 
@@ -94,7 +95,7 @@ def print_folds(found: tuning.CrossValidation) -> None:
             "work is the mean over the folds, in filterings of all training runs; one with its gradient"
             f" takes the time of {found.gradient_cost:.2f}"
         )
-    units = units_by_name(found.folds[0].tuned.model)
+    units = leaves_by_name(found.folds[0].tuned.model.units)
     rows: list[list[Any]] = []
     for name, spread in found.parameters.items():
         turn, unit = in_degrees(units[name])

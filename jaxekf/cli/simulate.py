@@ -6,7 +6,14 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from jaxekf.cli.console import json_option, output_option, overwrite_option, print_json, wrote
+from jaxekf.cli.console import (
+    default_option,
+    json_option,
+    output_option,
+    overwrite_option,
+    print_json,
+    wrote,
+)
 from jaxekf.cli.options import Finite, Span, hidden, spans
 from jaxekf.io import atomic, run_folder
 from jaxekf.recordings.types import Recording
@@ -20,77 +27,45 @@ _TOOL_ONLY = ("hide", "latency", "marker_noise", "accelerometer_noise", "acceler
 
 @click.command()
 @output_option("runs", "Folder for the run folders MOTION-SEED.")
-@click.option(
+@default_option(
     "--motion",
-    type=click.Choice(["free", "constant-rate", "tool"]),
-    default="free",
-    show_default=True,
-    help="Motion. free: smooth rotation about all axes; constant-rate: rotation about x at a constant rate;"
+    click.Choice(["free", "constant-rate", "tool"]),
+    "free",
+    "Motion. free: smooth rotation about all axes; constant-rate: rotation about x at a constant rate;"
     " tool: hand motion in six degrees of freedom, measured as single markers.",
 )
-@click.option(
-    "--runs", type=click.IntRange(1), default=1, show_default=True, help="Number of runs."
-)
-@click.option(
+@default_option("--runs", click.IntRange(1), 1, "Number of runs.")
+@default_option(
     "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Random seed of the first run; it increases by one from run to run.",
+    click.IntRange(0),
+    0,
+    "Random seed of the first run; it increases by one from run to run.",
 )
-@click.option(
-    "--duration", type=Finite(0.5, 1e5), default=60.0, show_default=True, help="Duration, s."
-)
-@click.option(
-    "--rate",
-    type=Finite(-1e4, 1e4),
-    default=-9.0,
-    show_default=True,
-    help="Rate of the constant-rate motion, deg/s.",
-)
-@click.option(
-    "--speed",
-    type=Finite(-1e4, 1e4),
-    default=40.0,
-    show_default=True,
-    help="Rate of the free motion, deg/s RMS per axis.",
-)
-@click.option(
-    "--rest", type=Finite(0.0), default=5.0, show_default=True, help="Rest at the start, s."
-)
+@default_option("--duration", Finite(0.5, 1e5), 60.0, "Duration, s.")
+@default_option("--rate", Finite(-1e4, 1e4), -9.0, "Rate of the constant-rate motion, deg/s.")
+@default_option("--speed", Finite(-1e4, 1e4), 40.0, "Rate of the free motion, deg/s RMS per axis.")
+@default_option("--rest", Finite(0.0), 5.0, "Rest at the start, s.")
 @click.option(
     "--occlusion",
     multiple=True,
     callback=spans,
     help="Interval START,END without tracker samples, s; repeatable.",
 )
-@click.option(
-    "--dropouts",
-    type=Finite(0.0, 1.0),
-    default=0.0,
-    show_default=True,
-    help="Fraction of tracker samples lost at random.",
-)
-@click.option(
+@default_option("--dropouts", Finite(0.0, 1.0), 0.0, "Fraction of tracker samples lost at random.")
+@default_option(
     "--optical-noise",
-    type=Finite(0.0, 1e3),
-    default=0.3,
-    show_default=True,
-    help="Standard deviation of the tracker's attitude, deg per axis.",
+    Finite(0.0, 1e3),
+    0.3,
+    "Standard deviation of the tracker's attitude, deg per axis.",
 )
-@click.option(
+@default_option(
     "--gyroscope-noise",
-    type=Finite(0.0, 1e3),
-    default=0.05,
-    show_default=True,
-    help="White noise density of the gyroscope, deg/s/sqrt(Hz).",
+    Finite(0.0, 1e3),
+    0.05,
+    "White noise density of the gyroscope, deg/s/sqrt(Hz).",
 )
-@click.option(
-    "--bias",
-    type=Finite(0.0, 1e3),
-    default=0.5,
-    show_default=True,
-    help="Standard deviation of the initial gyroscope bias, deg/s.",
+@default_option(
+    "--bias", Finite(0.0, 1e3), 0.5, "Standard deviation of the initial gyroscope bias, deg/s."
 )
 @click.option(
     "--bias-walk",
@@ -105,33 +80,26 @@ _TOOL_ONLY = ("hide", "latency", "marker_noise", "accelerometer_noise", "acceler
     help="Interval START,END[,MARKER...] in which the named markers out of 1, 2, 3, or all, are hidden, s"
     " (tool); repeatable.",
 )
-@click.option(
-    "--latency",
-    type=Finite(0.0, 10.0),
-    default=0.034,
-    show_default=True,
-    help="Latency of the tracker's time stamps, s (tool).",
+@default_option(
+    "--latency", Finite(0.0, 10.0), 0.034, "Latency of the tracker's time stamps, s (tool)."
 )
-@click.option(
+@default_option(
     "--marker-noise",
-    type=Finite(0.0, 1e3),
-    default=0.231,
-    show_default=True,
-    help="Standard deviation of a marker position, mm per axis (tool).",
+    Finite(0.0, 1e3),
+    0.231,
+    "Standard deviation of a marker position, mm per axis (tool).",
 )
-@click.option(
+@default_option(
     "--accelerometer-noise",
-    type=Finite(0.0, 1e6),
-    default=1.85,
-    show_default=True,
-    help="White noise density of the accelerometer, mg/sqrt(Hz) (tool).",
+    Finite(0.0, 1e6),
+    1.85,
+    "White noise density of the accelerometer, mg/sqrt(Hz) (tool).",
 )
-@click.option(
+@default_option(
     "--accelerometer-bias",
-    type=Finite(0.0, 1e3),
-    default=0.1,
-    show_default=True,
-    help="Standard deviation of the initial accelerometer bias, m/s^2 (tool).",
+    Finite(0.0, 1e3),
+    0.1,
+    "Standard deviation of the initial accelerometer bias, m/s^2 (tool).",
 )
 @overwrite_option
 @json_option

@@ -4,17 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import click
-import jax
 import numpy as np
 
 import tuning
 from jaxekf._support import memory
-from jaxekf.cli.comparison import in_degrees, print_comparison, short, units_by_name
+from jaxekf.cli.comparison import in_degrees, print_comparison, short
 from jaxekf.cli.console import (
+    default_option,
     json_option,
     model_option,
     noise_option,
     note,
+    output_option,
     overwrite_option,
     print_json,
     print_table,
@@ -62,11 +63,11 @@ _RENAMED = {
 @model_option
 @noise_option
 @sort_option
-@click.option(
+@default_option(
     "--objective",
-    default="attitude",
-    show_default=True,
-    help="Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
+    None,
+    "attitude",
+    "Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
     " attitude+0.1*likelihood.",
 )
 @click.option(
@@ -93,20 +94,18 @@ _RENAMED = {
     help="Shape of free noise: one deviation for all axes, one for each, or a full matrix.  [default: as at"
     " the start]",
 )
-@click.option(
+@default_option(
     "--optimiser",
-    type=click.Choice(tuple(NAMED)),
-    default="lbfgs",
-    show_default=True,
-    help="Optimiser: lbfgs; fisher scoring, which takes few steps, for likelihood or map with up to about"
+    click.Choice(tuple(NAMED)),
+    "lbfgs",
+    "Optimiser: lbfgs; fisher scoring, which takes few steps, for likelihood or map with up to about"
     " thirty numbers; adam on minibatches, for very many runs.",
 )
-@click.option(
+@default_option(
     "--starts",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Number of starts, the given one and samples about it; successive halving drops the worse half"
+    click.IntRange(1),
+    1,
+    "Number of starts, the given one and samples about it; successive halving drops the worse half"
     " after 8, 16 and 32 iterations.",
 )
 @click.option(
@@ -114,33 +113,18 @@ _RENAMED = {
     type=click.IntRange(1),
     help="Runs per step of adam; an iteration is a pass over all runs.  [default: 16]",
 )
-@click.option(
+@default_option(
     "--seed",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Seed of the sampled starts, and of the order of adam's batches.",
+    click.IntRange(0),
+    0,
+    "Seed of the sampled starts, and of the order of adam's batches.",
 )
-@click.option(
-    "--iterations",
-    type=click.IntRange(1),
-    default=60,
-    show_default=True,
-    help="Largest number of iterations.",
+@default_option("--iterations", click.IntRange(1), 60, "Largest number of iterations.")
+@default_option(
+    "--patience", click.IntRange(1), 15, "Largest number of iterations without improvement."
 )
-@click.option(
-    "--patience",
-    type=click.IntRange(1),
-    default=15,
-    show_default=True,
-    help="Largest number of iterations without improvement.",
-)
-@click.option(
-    "--burn-in",
-    type=click.FloatRange(0.0),
-    default=0.0,
-    show_default=True,
-    help="Time at the start of each run that does not count, s.",
+@default_option(
+    "--burn-in", click.FloatRange(0.0), 0.0, "Time at the start of each run that does not count, s."
 )
 @click.option(
     "--rescale/--no-rescale",
@@ -149,11 +133,11 @@ _RENAMED = {
     " and the objective has errors alone]",
 )
 @click.option("--smooth", is_flag=True, help="Errors of the smoothed estimate.")
-@click.option(
+@default_option(
     "--confidence-intervals/--no-confidence-intervals",
-    default=True,
-    show_default=True,
-    help="95 % confidence intervals from the Fisher information; unobservable parameters revert to their"
+    None,
+    True,
+    "95 % confidence intervals from the Fisher information; unobservable parameters revert to their"
     " initial values.",
 )
 @click.option(
@@ -171,14 +155,7 @@ _RENAMED = {
 @folds_option
 @baselines_option
 @static_option
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    default=Path("tuned"),
-    show_default=True,
-    help="Output folder.",
-)
+@output_option("tuned", "Output folder.")
 @overwrite_option
 @json_option
 def tune(
@@ -191,17 +168,9 @@ def tune(
     free: tuple[str, ...],
     own: tuple[str, ...],
     spec: Path | None,
-    axes: str | None,
     optimiser: str,
-    starts: int,
     batch: int | None,
-    seed: int,
-    iterations: int,
-    patience: int,
     burn_in: float,
-    rescale: bool | None,
-    smooth: bool,
-    confidence_intervals: bool,
     warm: bool | None,
     state: Path | None,
     folds: int | None,
@@ -210,6 +179,7 @@ def tune(
     output: Path,
     overwrite: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Tune on RUNS and write noise.toml, calibration.toml, and tuning.json for jaxekf report.
 
@@ -227,22 +197,15 @@ def tune(
     for run in training + validation if aim.needs_truth else ():
         if run.encoder is None:
             note(f"run '{run.name}' has no encoder and does not count in the error")
-    options: dict[str, Any] = {
+    # The others of `tuning.tune` have the names of their options: axes, starts, seed, iterations, ...
+    options |= {
         "validate": validation,
         "model": chosen,
         "objective": aim,
         "free": chosen_free or None,
         "start": start,
-        "axes": axes,
         "optimiser": from_name(optimiser, batch),
-        "starts": starts,
-        "seed": seed,
-        "iterations": iterations,
-        "patience": patience,
         "burn_in_s": burn_in,
-        "rescale": rescale,
-        "smooth": smooth,
-        "confidence_intervals": confidence_intervals,
         "warm": aim.errors_alone and optimiser != "adam" if warm is None else warm,
     }
     unseen = None
@@ -251,7 +214,10 @@ def tune(
         unseen = held_out(training, folds, **compared, **options)
         if not as_json:
             print_folds(unseen)
-    with memory.for_runs([run.name for run in training]), tuning_progress(iterations) as progress:
+    with (
+        memory.for_runs([run.name for run in training]),
+        tuning_progress(options["iterations"]) as progress,
+    ):
         tuned = tuning.tune(training, checkpoint=state, progress=progress, **options)
     tuning.save(tuned, output, folds=unseen)
     if state is not None and folds is not None and "interrupted" not in tuned.stopped:
@@ -259,7 +225,7 @@ def tune(
     _note(tuned, output)
     scored = [run for run in validation or training if run.encoder is not None]
     theirs = tuning.fit_runs(scored, tuned, burn_in_s=burn_in) if validation else {}
-    rows = _compare(tuned, scored, start, theirs, smooth) if scored else []
+    rows = _compare(tuned, scored, start, theirs, options["smooth"]) if scored else []
     tuning.save_record(output, tuned, rows=rows, folds=unseen)
     if as_json:
         document = parameters.to_document(chosen, tuned.params, tuned.origin)
@@ -344,12 +310,11 @@ def _print_known(tuned: tuning.Tuned) -> None:
 
 
 def _print_noise(tuned: tuning.Tuned) -> None:
-    units = units_by_name(tuned.model)
-    names = parameters.leaf_names(tuned.params)
-    before = jax.tree.leaves(tuned.start._replace(truth=()))
-    after = jax.tree.leaves(tuned.params)
+    units = parameters.leaves_by_name(tuned.model.units)
+    before = parameters.leaves_by_name(tuned.start._replace(truth=()))
     rows = []
-    for name, old, new in zip(names, before, after, strict=True):
+    for name, new in parameters.leaves_by_name(tuned.params).items():
+        old = before[name]
         if np.array_equal(old, new):
             continue
         turn, shown = in_degrees(units[name])

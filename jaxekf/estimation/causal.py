@@ -149,6 +149,23 @@ def estimate_online(
         The model has no input, or its sensors have different latencies (then use `Stream`).
     RecordingError, FilterError, ResourceError, PrecisionError
         As in `jaxekf.estimate`.
+
+    Examples
+    --------
+    The tracker's samples arrive 48 ms after they were taken:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> stamps = optical.time_ns + 48_000_000
+    >>> run = run.replace(optical=replace(optical, time_ns=stamps, latency_ns=48_000_000))
+    >>> live, after = jaxekf.estimate_online(run, "loose"), jaxekf.estimate(run, "loose")
+    >>> print(f"first estimate after {(live.time_ns[0] - after.time_ns[0]) / 1e6:.0f} ms")
+    first estimate after 48 ms
+    >>> bool(jaxekf.score(live, run).attitude_rmse_deg > jaxekf.score(after, run).attitude_rmse_deg)
+    True
     """
     recording = read([run])[0]
     _need_input(get_model(model))

@@ -39,6 +39,11 @@ def leaf_names(section: Any) -> list[str]:
     ]
 
 
+def leaves_by_name(section: Any) -> dict[str, Any]:
+    """The leaves of a pytree of parameters by their dotted names, in the order of its leaves."""
+    return dict(zip(leaf_names(section), jax.tree.leaves(section), strict=True))
+
+
 def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters as a TOML document; each leaf has its value and unit."""
     document: dict[str, Any] = {
@@ -47,15 +52,12 @@ def to_document(model: Model, params: Parameters, origin: Mapping[str, Any]) -> 
         "origin": dict(origin),
     }
     for section in _SECTIONS:
-        values, units = getattr(params, section), getattr(model.units, section)
-        entries = {}
-        for name, value, unit in zip(
-            leaf_names(values), jax.tree.leaves(values), jax.tree.leaves(units), strict=True
-        ):
-            entries[name] = {"value": np.asarray(value, float).tolist(), "unit": unit}
-            if unit.startswith("rad"):
-                degrees = np.rad2deg(np.asarray(value, float))
-                entries[name]["value_deg"] = np.round(degrees, 9).tolist()
+        units, entries = leaves_by_name(getattr(model.units, section)), {}
+        for name, value in leaves_by_name(getattr(params, section)).items():
+            array = np.asarray(value, float)
+            entries[name] = {"value": array.tolist(), "unit": units[name]}
+            if units[name].startswith("rad"):
+                entries[name]["value_deg"] = np.round(np.rad2deg(array), 9).tolist()
         document[section] = entries
     return document
 
@@ -67,11 +69,9 @@ def described_arrays(model: Model, params: Parameters) -> dict[str, tuple[Any, s
     """
     described = {}
     for section in (*_SECTIONS, "setup"):
-        values, units = getattr(params, section), getattr(model.units, section)
-        names, leaves = leaf_names(values), jax.tree.leaves(values)
-        unit_names = jax.tree.leaves(units) if section != "setup" else ["SI"] * len(names)
-        for name, leaf, unit in zip(names, leaves, unit_names, strict=True):
-            described[f"{section}/{name}"] = (np.asarray(leaf), unit)
+        units = {} if section == "setup" else leaves_by_name(getattr(model.units, section))
+        for name, leaf in leaves_by_name(getattr(params, section)).items():
+            described[f"{section}/{name}"] = (np.asarray(leaf), units.get(name, "SI"))
     return described
 
 
@@ -95,6 +95,19 @@ def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str
     ------
     ModelError
         A standard deviation is not positive and finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaxekf.save_parameters(folder, model, model.parameters, {"by": "hand"})
+    ...     lines = Path(folder, "noise.toml").read_text().splitlines()
+    >>> at = lines.index("[noise.optical]")
+    >>> print("; ".join(lines[at : at + 4]))
+    [noise.optical]; value = 0.005235987755982988; unit = "rad"; value_deg = 0.3
     """
     save_noise(path, model, params, origin)
     if leaf_names(params.calibration):
@@ -167,6 +180,18 @@ def load(model: str | Model, *paths: Path | str) -> Parameters:
         A file is missing, is not TOML, or has other entries, units or shapes than the model.
     ModelError
         A file is of another model, or a standard deviation is not positive and finite.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> noise = model.parameters.noise._replace(optical=0.004)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     jaxekf.save_parameters(folder, model, model.parameters._replace(noise=noise), {})
+    ...     params = jaxekf.load_parameters("loose", folder)
+    >>> print(f"{params.noise.optical:.3f} rad")
+    0.004 rad
     """
     model = get_model(model)
     params = model.parameters
@@ -247,8 +272,7 @@ def _with_document(
 def check(params: Parameters, place: str = "parameters") -> None:
     """Raise `ModelError` for a noise or initial standard deviation that is not positive and finite."""
     for section in ("noise", "initial"):
-        tree = getattr(params, section)
-        for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True):
+        for name, leaf in leaves_by_name(getattr(params, section)).items():
             value = np.asarray(leaf, float)
             deviations = np.diagonal(value) if value.ndim == 2 else value
             if not (np.all(np.isfinite(value)) and np.all(deviations > 0.0)):
@@ -259,21 +283,17 @@ def check(params: Parameters, place: str = "parameters") -> None:
 
 
 def _with_entries(path: Path, section: str, default: Any, units: Any, entries: Any) -> Any:
-    names = leaf_names(default)
+    leaves, units = leaves_by_name(default), leaves_by_name(units)
     if not isinstance(entries, dict):
         raise RecordingError(path, f"{section} = {entries!r}", "a section", f"[{section}.NAME]")
-    unknown = set(entries) - set(names)
-    if unknown:
-        raise RecordingError(
-            path, f"{section} entries {sorted(unknown)}", f"some of {names}", "correcting the names"
-        )
-    leaves, structure = jax.tree.flatten(default)
-    filled = []
-    for name, unit, leaf in zip(names, jax.tree.leaves(units), leaves, strict=True):
+    if unknown := sorted(set(entries) - set(leaves)):
+        expected = f"some of {list(leaves)}"
+        raise RecordingError(path, f"{section} entries {unknown}", expected, "correcting the names")
+    for name, leaf in leaves.items():
         if name in entries:
-            leaf = _value(path, f"{section}.{name}", entries[name], unit, np.shape(leaf))
-        filled.append(leaf)
-    return jax.tree.unflatten(structure, filled)
+            given = entries[name], units[name], np.shape(leaf)
+            leaves[name] = _value(path, f"{section}.{name}", *given)
+    return jax.tree.unflatten(jax.tree.structure(default), list(leaves.values()))
 
 
 def _value(path: Path, name: str, entry: Any, unit: str, shape: tuple[int, ...]) -> Any:

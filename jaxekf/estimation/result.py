@@ -21,7 +21,43 @@ __all__ = ["Estimate", "Estimated", "OutputEstimate", "SensorRecord", "trackers"
 
 @dataclass(frozen=True)
 class Estimate(EstimateData):
-    """The estimate of one run, at every instant of its timeline."""
+    """The estimate of one run, at every instant of its timeline.
+
+    Attributes
+    ----------
+    time_ns
+        (N,) int64 nanoseconds on the recording's clock; `time` is in seconds since the first instant.
+    state
+        The model's state with a leading axis (N,).
+    cov
+        (N, n, n) covariance of the error vector, whose rows are named by `error_labels`.
+    outputs
+        `OutputEstimate` by name, such as ``attitude`` and ``rate``.
+    sensors
+        `SensorRecord` with the innovations of each sensor, by name.
+    requested
+        The estimate at the times of ``estimate(at=...)``; None without them.
+    account
+        Number of rows of each stream that were read, used, masked, gated and dropped.
+    params
+        The parameters that were used.
+    notes
+        Remarks on how the run was read and initialised.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> print(f"{len(estimate.time)} instants over {estimate.time[-1]:.0f} s")
+    3001 instants over 24 s
+    >>> print(np.rad2deg(estimate.attitude.sigma[-1]).round(2))  # deg
+    [0.04 0.04 0.04]
+    >>> account = estimate.account["optical"]
+    >>> print(f"{account['used']} of {account['read']} samples of the tracker, {account['masked']} hidden")
+    1272 of 1501 samples of the tracker, 229 hidden
+    """
 
     def export(self, path: Path | str, *, overwrite: bool = False) -> Path:
         """Write one file, atomically, in the format of its suffix.

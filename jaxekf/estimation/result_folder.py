@@ -48,7 +48,7 @@ def write(
     if made.requested is not None:
         exported, added = made.requested, {"csv": "requested.csv"} | added
     with whole_folder(path, "result.json", overwrite=overwrite) as folder:
-        write_file(made, "csv", folder / "estimate.csv")
+        columns = _write_table(made, folder / "estimate.csv")
         for form, name in added.items():
             write_file(exported, form, folder / name)
         _write_covariance(made, folder / "covariance.npz")
@@ -60,15 +60,14 @@ def write(
             {"": Entry(None, _facts(made)), **_innovations(made)},
         )
         parameters.save(folder, made.model, made.params, {"run": made.run})
-        text = codec.as_text(_document(made, diagnosis, score))
+        text = codec.as_text(_document(made, columns, diagnosis, score))
         (folder / "result.json").write_text(text, "utf-8")
 
 
 def write_file(made: EstimateData, form: str, file: Path) -> None:
     """Write one file in a format of `export`."""
     if form == "csv":
-        columns, values = _table(made)
-        write_csv(file, [column.name for column in columns], made.time_ns, values, 12)
+        _write_table(made, file)
     elif form == "tum":
         if "attitude" not in made.outputs:
             raise ModelError(
@@ -87,14 +86,24 @@ def write_file(made: EstimateData, form: str, file: Path) -> None:
         {"npz": export.write_npz, "hdf5": export.write_hdf5}[form](file, _entries(made))
 
 
+def _write_table(made: EstimateData, file: Path) -> list[Column]:
+    """Write states, outputs and their standard deviations as CSV. Returns the columns after the time."""
+    columns, values = _table(made)
+    write_csv(file, [column.name for column in columns], made.time_ns, values, 12)
+    return columns
+
+
 def _document(
-    made: EstimateData, diagnosis: Mapping[str, Any] | None, score: Mapping[str, Any] | None
+    made: EstimateData,
+    columns: list[Column],
+    diagnosis: Mapping[str, Any] | None,
+    score: Mapping[str, Any] | None,
 ) -> ResultDocument:
     """`result.json`; diagnosis and score are written as they are given."""
     given: dict[str, Any] = {"diagnosis": diagnosis, "score": score}
     return ResultDocument(
         **made.summary(),
-        estimate_columns=[Column("time", "s"), *_table(made)[0]],
+        estimate_columns=[Column("time", "s"), *columns],
         innovation_units={
             name: list(manifold.error_units(made.model.sensor(name).space)) for name in made.sensors
         },

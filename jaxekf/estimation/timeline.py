@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation._step_layout import arrange, epochs_of, slow_sensors
 from jaxekf.estimation.output_times import OutputTimes, select_output_times
 from jaxekf.filtering.model import Model, Sensor, Start
-from jaxekf.filtering.steps import Knots, Rows, Steps
+from jaxekf.filtering.steps import Knots, Steps
 from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S, longest_ns
 from jaxekf.recordings.sample_selection import (
     count,
@@ -28,20 +29,33 @@ from jaxekf.recordings.sample_selection import (
     take,
     visible,
 )
-from jaxekf.recordings.types import NANOSECONDS, Recording, Samples, Times, period_ns
+from jaxekf.recordings.types import NANOSECONDS, Recording, Samples, Times
 
-_UPDATE_COST = 3.0  # of one slow update, in predictions; used only to choose the length of epochs
-_LONGEST_EPOCH = 32
 _EXTRAPOLATED_S = 0.5
 """A note names longer intervals without any sample."""
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The steps of one run, with the data that stays on the host."""
+    """The steps of one run, with the data that stays on the host.
+
+    Examples
+    --------
+    Two samples of the gyroscope for one of the tracker make epochs of two substeps:
+
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> line = jaxekf.timeline.build(jaxekf.get_model("loose"), run)
+    >>> line.time_ns.shape, list(line.first), int(line.valid.sum())
+    ((1501, 2), ['optical'], 3001)
+    >>> line.account["optical"]["fed"], line.account["optical"]["masked"]
+    (1272, 229)
+    """
 
     name: str
+    """Name of the run."""
     steps: Steps
+    """The inputs of the filter, leading axes (K, S)."""
     time_ns: Times
     """(K, S) int64 nanoseconds at the end of each substep."""
     first: dict[str, Any]
@@ -98,6 +112,16 @@ def build(
     ModelError
         A sensor has no source, or `at` is given for a model whose steps are the samples of one stream
         (`Model.hold_to`).
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> model = jaxekf.get_model("loose")
+    >>> jaxekf.timeline.build(model, run).steps.dt.shape
+    (1501, 2)
+    >>> jaxekf.timeline.build(model, run, at=jaxekf.every(0.01)).requested_ns.shape
+    (2401,)
     """
     samples = {s.name: _read(s, recording) for s in model.sensors}
     driver, counted = None, dict(samples)
@@ -134,9 +158,9 @@ def build(
         notes += (note,) if note else ()
     times = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
     if slow is None:
-        slow = _slow_sensors(samples, times)
-    index = _epochs(times, [samples[name].time_ns for name in slow])
-    steps, step_times = _arrange(times, index, samples, slow, start)
+        slow = slow_sensors(samples, times)
+    index = epochs_of(times, [samples[name].time_ns for name in slow])
+    steps, step_times = arrange(times, index, samples, slow, start)
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
     if start_sample is None:
@@ -195,6 +219,14 @@ def build_many(
     ------
     RecordingError, ModelError
         As in `build`.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> runs = [jaxekf.load(path) for path in jaxekf.demo.paths(("free-4", "free-5"))]
+    >>> lines = jaxekf.timeline.build_many(jaxekf.get_model("loose"), runs)
+    >>> [(line.name, line.steps.dt.shape) for line in lines]
+    [('free-4', (1501, 2)), ('free-5', (1501, 2))]
     """
     timelines: list[Timeline] = []
     at = [None] * len(recordings) if at is None else at
@@ -217,6 +249,28 @@ def from_steps(name: str, steps: Steps, first: dict[str, Any], start_ns: int = 0
         First visible sample of each sensor, for the initial state.
     start_ns
         Time of the start, int64 nanoseconds.
+
+    Returns
+    -------
+    Timeline
+        Without account and notes.
+
+    Examples
+    --------
+    Two epochs of one substep each, without samples and input, from 1 s on:
+
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> steps = jaxekf.Steps(
+    ...     time=np.array([[0.0], [0.5]]),
+    ...     dt=np.array([[0.0], [0.5]]),
+    ...     valid=np.ones((2, 1), bool),
+    ...     knots=None,
+    ...     fast={},
+    ...     slow={},
+    ... )
+    >>> jaxekf.timeline.from_steps("simulated", steps, {}, 1_000_000_000).time_ns.ravel()
+    array([1000000000, 1500000000])
     """
     time_ns = start_ns + np.round(np.asarray(steps.time) * NANOSECONDS).astype(np.int64)
     return Timeline(name, steps, time_ns, first)
@@ -309,17 +363,12 @@ def _run_interval(
     end = max(int(s.time_ns[-1]) for s in samples.values())
     if driver is not None:
         for name, stream in samples.items():
-            if stream.time_ns[0] > driver.time_ns[-1] or stream.time_ns[-1] < driver.time_ns[0]:
-                raise RecordingError(
-                    place,
-                    f"{name} over {_describe(stream.time_ns)} and the input"
-                    f" over {_describe(driver.time_ns)}",
-                    "streams that overlap in time",
-                    "checking the clocks and units of both",
-                )
+            _need_overlap(place, name, stream.time_ns, "the input", driver.time_ns)
         start, end = int(driver.time_ns[0]), int(driver.time_ns[-1])
-    elif model.hold_to is None and len(samples) > 1:
-        _check_overlap(place, samples)
+    elif model.hold_to is None:
+        first, *others = samples
+        for other in others:
+            _need_overlap(place, first, samples[first].time_ns, other, samples[other].time_ns)
     for name in model.start_with:
         stream = samples[name]
         seen = stream.time_ns[visible(stream) & (stream.time_ns >= start)]
@@ -345,79 +394,30 @@ def _run_interval(
     return start_sample.time_ns, end, start_sample
 
 
-def _check_overlap(place: Any, samples: dict[str, Samples]) -> None:
-    names = list(samples)
-    for other in names[1:]:
-        a, b = samples[names[0]].time_ns, samples[other].time_ns
-        if a[0] > b[-1] or a[-1] < b[0]:
-            raise RecordingError(
-                place,
-                f"{names[0]} over {_describe(a)} and {other} over {_describe(b)}",
-                "streams that overlap in time",
-                "checking the clocks and units of both",
-            )
-
-
-def _slow_sensors(samples: dict[str, Samples], times: Times) -> tuple[str, ...]:
-    """Sensors with samples at no more than half of the instants."""
-    return tuple(name for name, s in samples.items() if 2 * len(s.time_ns) <= len(times) + 1)
-
-
-def _epochs(times: Times, slow_times: list[Times]) -> NDArray[np.intp]:
-    """Index (K, S) into `times` of each substep, -1 in padding; slow samples are at the last substep."""
-    if not slow_times:
-        return np.arange(len(times))[:, None]
-    ends = np.flatnonzero(np.isin(times, np.concatenate(slow_times)))
-    if ends.size == 0 or ends[-1] != len(times) - 1:
-        ends = np.append(ends, len(times) - 1)
-    lengths = np.diff(ends, prepend=-1)
-    sizes = np.arange(1, min(_LONGEST_EPOCH, int(lengths.max())) + 1)
-    epochs = np.array([np.ceil(lengths / size).sum() for size in sizes])
-    size = int(sizes[np.argmin(epochs * (sizes + _UPDATE_COST))])
-    chunks = np.ceil(lengths / size).astype(int)
-    index = np.full((int(chunks.sum()), size), -1)
-    last_row = np.cumsum(chunks) - 1
-    for end, length, row in zip(ends, lengths, last_row, strict=True):
-        instants = np.arange(end - length + 1, end + 1)
-        offset = (row + 1) * size - length
-        index.reshape(-1)[offset : offset + length] = instants
-    return index
-
-
-def _arrange(
-    times: Times,
-    index: NDArray[np.intp],
-    samples: dict[str, Samples],
-    slow: tuple[str, ...],
-    start: int,
-) -> tuple[Steps, Times]:
-    valid = index >= 0
-    # A padded substep has the time of the valid one before it, or that of the start.
-    flat = np.maximum.accumulate(index.reshape(-1)).reshape(index.shape)
-    step_times = np.where(flat >= 0, times[np.maximum(flat, 0)], start)
-    dt_ns = np.diff(step_times.reshape(-1), prepend=start).reshape(index.shape)
-    fast = {
-        n: _rows(s, np.where(valid, step_times, -1)) for n, s in samples.items() if n not in slow
-    }
-    ends = {n: _rows(samples[n], np.where(valid, step_times, -1)[:, -1]) for n in slow}
-    steps = Steps((step_times - start) / NANOSECONDS, dt_ns / NANOSECONDS, valid, None, fast, ends)
-    return steps, step_times
-
-
-def _rows(samples: Samples, times: Times) -> Rows:
-    """The samples at these times, masked at times without one."""
-    at = np.clip(np.searchsorted(samples.time_ns, times), 0, len(samples.time_ns) - 1)
-    here = samples.time_ns[at] == times
-    nominal = period_ns(samples.time_ns)
-    since = np.diff(samples.time_ns, prepend=samples.time_ns[0] - nominal)
-    # A sample after a gap is not an average over the gap: its period is the nominal one.
-    since = np.minimum(since, nominal) / NANOSECONDS
-    taken = take(samples, at)
-    return Rows(taken.value, taken.aux, taken.mask & here[..., None], since[at])
+def _need_overlap(place: Any, name: str, times: Times, other: str, others: Times) -> None:
+    if times[0] > others[-1] or times[-1] < others[0]:
+        raise RecordingError(
+            place,
+            f"{name} over {_describe(times)} and {other} over {_describe(others)}",
+            "streams that overlap in time",
+            "checking the clocks and units of both",
+        )
 
 
 def knots_from(time_ns: Times, value: Any, start: int) -> Knots:
-    """Knots of an input with samples `value` (N, C) at `time_ns` (N,), in seconds since `start` (ns)."""
+    """Knots of an input with samples `value` (N, C) at `time_ns` (N,), in seconds since `start` (ns).
+
+    Examples
+    --------
+    A rate of 2 rad/s for half a second:
+
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> knots = jaxekf.timeline.knots_from(np.array([0, 500_000_000]), [[2.0], [2.0]], start=0)
+    >>> knots.integral
+    array([[0.],
+           [1.]])
+    """
     time = (time_ns - start) / NANOSECONDS
     value = np.asarray(value, float)
     steps = 0.5 * (value[1:] + value[:-1]) * np.diff(time)[:, None]

@@ -26,9 +26,24 @@ _CERTAIN = 4.0
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squares (NIS of innovations, NEES of errors) against the chi-square distribution."""
+    """Normalised squares (NIS of innovations, NEES of errors) against the chi-square distribution.
+
+    Examples
+    --------
+    The NIS of the tracker: 1 is within the confidence interval of its mean:
+
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> nis = jaxekf.diagnose(estimate).sensors["optical"].nis
+    >>> print(f"{nis.mean:.2f} of {nis.samples} samples of {nis.freedom:.0f} degrees of freedom")
+    0.98 of 1272 samples of 3 degrees of freedom
+    >>> nis.interval[0] < 1.0 < nis.interval[1]
+    True
+    """
 
     samples: int
+    """Number of squares."""
     freedom: float
     """Mean degrees of freedom of a sample."""
     mean: float
@@ -57,7 +72,21 @@ class Consistency:
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Statistics of whitened innovations, which are independent with variance 1 for a consistent filter."""
+    """Statistics of whitened innovations, which are independent with variance 1 for a consistent filter.
+
+    Examples
+    --------
+    The share of lags at which the autocorrelation is within its bound of 95 %:
+
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> white = jaxekf.diagnose(estimate).sensors["optical"].whiteness
+    >>> white.autocorrelation.shape, bool(white.p > 1e-3)
+    ((3, 125), True)
+    >>> print(f"{(abs(white.autocorrelation) < white.bound).mean():.0%}")
+    95%
+    """
 
     lag_s: Floats
     """(L,) s, from one sampling period on."""

@@ -6,14 +6,30 @@ import numpy as np
 
 from jaxekf.estimation.result import Estimated
 from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
-from jaxekf.recordings.types import Encoder, Flags, Floats, Optical, Recording, Times, to_scipy
+from jaxekf.recordings.types import Floats, Optical, Recording, Times, to_scipy
 
 
 class Score(NamedTuple):
-    """Accuracy of one estimate on the scored samples of its encoder."""
+    """Accuracy of one estimate on the scored samples of its encoder.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> found = jaxekf.score(jaxekf.estimate(run), run)
+    >>> print(f"attitude {found.attitude_rmse_deg:.2f} deg, rate {found.rate_rmse_deg_s:.2f} deg/s")
+    attitude 0.09 deg, rate 0.98 deg/s
+    >>> print(f"NEES {found.attitude_nees:.2f} over {found.samples} samples")
+    NEES 0.99 over 3001 samples
+    >>> found.position_rmse_mm  # the model has no position
+    nan
+    """
 
     attitude_rmse_deg: float
+    """Root mean square of the angle of the attitude error, deg."""
     rate_rmse_deg_s: float
+    """Root mean square of the length of the rate's error, deg/s."""
     attitude_nees: float
     """Mean normalised estimation error squared per degree of freedom: 1 for a consistent filter, above 1
     for an overconfident one."""
@@ -22,6 +38,7 @@ class Score(NamedTuple):
     position_nees: float
     """NEES of the position, as `attitude_nees`."""
     samples: int
+    """Number of instants of the estimate that count."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -29,7 +46,16 @@ class Score(NamedTuple):
 
 
 def attitude_error(q: Floats, truth: Floats) -> Floats:
-    """Rotation vectors (N, 3), rad, from `q` to `truth`, in the body frame of `q`."""
+    """Rotation vectors (N, 3), rad, from `q` to `truth`, in the body frame of `q`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> identity, quarter_turn_about_z = np.eye(4)[:1], np.sqrt([[0.5, 0.0, 0.0, 0.5]])
+    >>> np.rad2deg(metrics.attitude_error(identity, quarter_turn_about_z)).round(6).tolist()
+    [[0.0, 0.0, 90.0]]
+    """
     return (to_scipy(q).inv() * to_scipy(truth)).as_rotvec()
 
 
@@ -54,6 +80,14 @@ def orientation_error(
         (N, 4) quaternions, body to reference.
     up
         Vertical in the reference frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> identity, quarter_turn_about_z = np.eye(4)[:1], np.sqrt([[0.5, 0.0, 0.0, 0.5]])
+    >>> [round(angle, 6) for angle in metrics.orientation_error(quarter_turn_about_z, identity)]
+    [90.0, 90.0, 0.0]
     """
     off = (to_scipy(q) * to_scipy(truth).inv()).as_quat()
     vertical = np.asarray(up) / np.linalg.norm(up)
@@ -67,19 +101,45 @@ def orientation_error(
 
 
 def rms(values: Floats) -> float:
-    """Root mean square of the lengths of vectors (N, d); NaN rows are ignored."""
+    """Root mean square of the lengths of vectors (N, d); NaN rows are ignored.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> metrics.rms(np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0]]))
+    5.0
+    """
     squared = np.sum(np.asarray(values) ** 2, axis=-1)
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(np.mean(squared))) if squared.size else float("nan")
 
 
 def normalised_square(error: Floats, cov: Floats) -> Floats:
-    """``e' inv(P) e`` (N,) of errors (N, d) and covariances (N, d, d)."""
+    """``e' inv(P) e`` (N,) of errors (N, d) and covariances (N, d, d).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> error, cov = np.array([[2.0, 6.0]]), np.diag([4.0, 9.0])[None]
+    >>> metrics.normalised_square(error, cov).tolist()  # 1^2 + 2^2
+    [5.0]
+    """
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
 
 
 def mean_nees(error: Floats, cov: Floats) -> float:
-    """Mean of ``e' inv(P) e / d`` over errors (N, d) and covariances (N, d, d); NaN for none."""
+    """Mean of ``e' inv(P) e / d`` over errors (N, d) and covariances (N, d, d); NaN for none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> error, cov = np.array([[0.1, -0.1, 0.1]]), 0.01 * np.eye(3)[None]
+    >>> round(metrics.mean_nees(error, cov), 6)  # errors as large as their deviations
+    1.0
+    """
     squared = normalised_square(error, cov)
     return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
 
@@ -145,29 +205,23 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
-    truth = encoder_at(recording.need_encoder(), estimate.time_ns)
-    judged = truth.scored & (estimate.time >= burn_in_s)
-    attitude = rate = nees = float("nan")
-    if "attitude" in estimate.outputs:
-        output = estimate.outputs["attitude"]
-        error = attitude_error(output.value[judged], truth.q_ref_body[judged])
-        attitude = float(np.rad2deg(rms(error)))
-        nees = mean_nees(error, output.cov[judged])
-    if "rate" in estimate.outputs:
-        true_rate = encoder_rate_at(recording.need_encoder(), estimate.time_ns)[judged]
-        rate = float(np.rad2deg(rms(estimate.outputs["rate"].value[judged] - true_rate)))
-    where, where_nees = _position_score(estimate, truth, judged)
-    return Score(attitude, rate, nees, where, where_nees, int(judged.sum()))
+    judged = encoder_at(recording.need_encoder(), estimate.time_ns).scored
+    judged = judged & (estimate.time >= burn_in_s)
+    errors = scored_errors(estimate, recording)
 
+    def rmse(name: str) -> float:
+        return rms(errors[name][judged]) if name in errors else float("nan")
 
-def _position_score(estimate: Estimated, truth: Encoder, judged: Flags) -> tuple[float, float]:
-    """RMSE in mm and NEES of the position; a blank position of the encoder is ignored."""
-    if "position" not in estimate.outputs or truth.position is None:
-        return float("nan"), float("nan")
-    judged = judged & np.isfinite(truth.position).all(axis=1)
-    position = estimate.outputs["position"]
-    error = truth.position[judged] - position.value[judged]
-    return 1e3 * rms(error), mean_nees(error, position.cov[judged])
+    def nees(name: str) -> float:
+        if name not in errors:
+            return float("nan")
+        # A blank position of the encoder is ignored.
+        known = judged & np.isfinite(errors[name]).all(axis=1)
+        return mean_nees(errors[name][known], estimate.outputs[name].cov[known])
+
+    attitude, rate = (float(np.rad2deg(rmse(name))) for name in ("attitude", "rate"))
+    position = 1e3 * rmse("position"), nees("position")
+    return Score(attitude, rate, nees("attitude"), *position, int(judged.sum()))
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:
@@ -178,7 +232,16 @@ def hold_last(optical: Optical, time_ns: Times) -> Floats:
 
 
 def score_hold_last(recording: Recording, time_ns: Times) -> float:
-    """Attitude RMSE, degrees, of the baseline `hold_last` on the encoder's scored samples."""
+    """Attitude RMSE, degrees, of the baseline `hold_last` on the encoder's scored samples.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.evaluation import metrics
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> round(metrics.score_hold_last(run, run.need_imu().time_ns), 1)  # deg, mostly of occlusions
+    12.4
+    """
     truth = encoder_at(recording.need_encoder(), time_ns)
     held = hold_last(recording.need_optical(), time_ns)
     error = attitude_error(held[truth.scored], truth.q_ref_body[truth.scored])

@@ -33,16 +33,39 @@ _SIGMAS = 6.0
 _SLOW = 2.5
 
 
+_Finding = tuple[str, str]
+"""Kind and sentence of a verdict."""
+
+
 @dataclass(frozen=True)
 class Fault:
-    """A systematic error found in the innovations of an attitude."""
+    """A systematic error found in the innovations of an attitude.
+
+    Examples
+    --------
+    The tracker's stamps are 20 ms late:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> fault = jaxekf.diagnose(jaxekf.estimate(late)).sensors["optical"].faults[0]
+    >>> print(f"{fault.kind} {fault.size[0]:.2f} {fault.unit}, {fault.effect:.0f} times the noise")
+    latency 0.02 s, 3 times the noise
+    >>> fault.p < 1e-8
+    True
+    """
 
     kind: str
     """`latency`, `gyroscope_bias` or `gyroscope_matrix`."""
     size: tuple[float, ...]
     """Latency in s; bias error in rad/s; or gyroscope matrix minus the assumed one, by rows."""
     sigma: tuple[float, ...]
+    """Standard deviation of each component of `size`."""
     unit: str
+    """Unit of `size`: s, rad/s or 1."""
     p: float
     """P-value of the hypothesis that there is no fault."""
     effect: float
@@ -51,7 +74,24 @@ class Fault:
 
 @dataclass(frozen=True)
 class Verdict:
-    """One inconsistency, for a program and for a person."""
+    """One inconsistency, for a program and for a person.
+
+    Examples
+    --------
+    The tracker's stamps are 20 ms late:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = run.replace(optical=replace(optical, time_ns=optical.time_ns + 20_000_000))
+    >>> verdict = jaxekf.diagnose(jaxekf.estimate(late)).verdicts[0]
+    >>> print(f"{verdict.about}: {verdict.kind} of {verdict.size:.2f} {verdict.unit}")
+    optical: latency of 0.02 s
+    >>> print(str(verdict).partition("; ")[2])
+    set the latency in recording.toml, or tune the calibration's clock offset or latency
+    """
 
     kind: str
     """`noise_too_small`, `noise_too_large`, `process_noise_too_large`, `outliers`, `correlated`, `biased`,
@@ -63,6 +103,7 @@ class Verdict:
     size: float | None
     """Size of the fault in `unit`; None for a verdict without one."""
     unit: str
+    """Unit of `size`; empty for a verdict without one."""
     sentence: str
     """The finding and its likely cause."""
 
@@ -130,7 +171,8 @@ def judge_sensor(
         Faults that are removed from the innovations already.
     """
     known = [fault.kind for fault in explained]
-    found, rest = [], f"the rest of the innovations of {sensor}" if explained else sensor
+    found: list[_Finding] = []
+    rest = f"the rest of the innovations of {sensor}" if explained else sensor
     first = float(white.autocorrelation.mean(axis=0)[:5].mean())
     certain = white.p < _WHITE_P
     sums = abs(white.total) > _SIGMAS * white.total_sigma
@@ -144,7 +186,7 @@ def judge_sensor(
     one_sided = bool(np.any(np.abs(white.mean) > np.maximum(_SIGMAS * white.mean_sigma, _EFFECT)))
     slow = positive and memory_s is not None and white.correlated_s > _SLOW * memory_s
     if "gyroscope_bias" not in known and (one_sided or slow):
-        found.append(_biased(sensor, nis, white, memory_s))
+        found.append(_biased(sensor, white, memory_s))
         positive = False
     off = not nis.interval[0] <= 1.0 <= nis.interval[1]
     large, small = off and nis.factor > _FACTOR, off and nis.factor < 1.0 / _FACTOR
@@ -153,30 +195,22 @@ def judge_sensor(
     elif large:
         found.append(_too_small(sensor, nis, white, labels))
     elif negative and (small or first < -_CORRELATION):
-        found.append(
-            _verdict(
-                "process_noise_too_large",
-                sensor,
-                nis,
-                f"innovations of {sensor} are {1 / nis.factor:.2f} times smaller than predicted and change"
-                " sign too often: the process noise (of the gyroscope, or of the motion) is set too large",
-            )
+        sentence = (
+            f"innovations of {sensor} are {1 / nis.factor:.2f} times smaller than predicted and change sign"
+            " too often: the process noise (of the gyroscope, or of the motion) is set too large"
         )
+        found.append(("process_noise_too_large", sentence))
     elif small:
-        found.append(
-            _verdict(
-                "noise_too_large",
-                sensor,
-                nis,
-                f"{sensor} noise is set too large by {1 / nis.factor:.2f}x (deviation): lower it or"
-                " tune it, or the process noise if that is the larger part of the covariance"
-                f"{_by_row(labels, white)}",
-            )
+        sentence = (
+            f"{sensor} noise is set too large by {1 / nis.factor:.2f}x (deviation): lower it or tune it, or"
+            f" the process noise if that is the larger part of the covariance{_by_row(labels, white)}"
         )
-    return found
+        found.append(("noise_too_large", sentence))
+    return [_verdict(finding, sensor, nis) for finding in found]
 
 
-def _verdict(kind: str, about: str, squares: Consistency, sentence: str) -> Verdict:
+def _verdict(finding: _Finding, about: str, squares: Consistency) -> Verdict:
+    kind, sentence = finding
     return Verdict(kind, about, squares.factor, None, "", sentence)
 
 
@@ -189,43 +223,31 @@ def _by_row(labels: Sequence[str], white: Whiteness) -> str:
     return f"; rows differ, from {shown[0]} to {shown[1]} of the predicted deviation"
 
 
-def _too_small(sensor: str, nis: Consistency, white: Whiteness, labels: Sequence[str]) -> Verdict:
+def _too_small(sensor: str, nis: Consistency, white: Whiteness, labels: Sequence[str]) -> _Finding:
     """Larger innovations without positive correlation: all of them, or a few."""
     if nis.typical - 1.0 < 0.3 * (nis.mean - 1.0):
-        return _verdict(
-            "outliers",
-            sensor,
-            nis,
+        return "outliers", (
             f"most innovations of {sensor} are as large as predicted, a few are far larger (mean square"
-            f" {nis.mean:.2f}, typical {nis.typical:.2f}): check for outliers, and gate them",
+            f" {nis.mean:.2f}, typical {nis.typical:.2f}): check for outliers, and gate them"
         )
-    return _verdict(
-        "noise_too_small",
-        sensor,
-        nis,
+    return "noise_too_small", (
         f"{sensor} noise is set too small by {nis.factor:.2f}x (deviation): raise it or tune it"
-        f"{_by_row(labels, white)}",
+        f"{_by_row(labels, white)}"
     )
 
 
-def _biased(sensor: str, nis: Consistency, white: Whiteness, memory_s: float | None) -> Verdict:
+def _biased(sensor: str, white: Whiteness, memory_s: float | None) -> _Finding:
     """Innovations with a mean, or correlated for much longer than the filter's time constant."""
     shown = ", ".join(f"{x:.2f}" for x in white.mean)
     if memory_s is None:
-        return _verdict(
-            "biased",
-            sensor,
-            nis,
+        return "biased", (
             f"innovations of {sensor} have a mean of ({shown}) of their deviations: check for a fixed bias,"
-            " or an error of alignment, lever arm, geometry or gravity",
+            " or an error of alignment, lever arm, geometry or gravity"
         )
-    return _verdict(
-        "gyroscope_bias",
-        sensor,
-        nis,
+    return "gyroscope_bias", (
         f"innovations of {sensor} drift over {_correlation_time(white)}, with a mean of ({shown}) of their"
         " deviations: the gyroscope's bias is fixed or its random walk is too small, or gravity is wrong in"
-        " a model that uses it",
+        " a model that uses it"
     )
 
 
@@ -238,41 +260,30 @@ def _correlation_time(white: Whiteness) -> str:
 
 def _correlated(
     sensor: str, nis: Consistency, white: Whiteness, memory_s: float | None, rest: str
-) -> Verdict:
+) -> _Finding:
     """Positive correlation: the prediction errs for longer than the filter assumes."""
     look = "latency, misalignment or wrong geometry, or process noise that is set too small"
     if memory_s is not None:
         look = "process noise (of the gyroscope, or of the motion) that is set too small"
     size = f" and {nis.factor:.2f} times as large as predicted" if nis.factor > _FACTOR else ""
     name = f"{rest} is" if rest != sensor else f"innovations of {sensor} are"
-    sentence = f"{name} correlated over {_correlation_time(white)}{size}: check for {look}"
-    return _verdict("correlated", sensor, nis, sentence)
+    return (
+        "correlated",
+        f"{name} correlated over {_correlation_time(white)}{size}: check for {look}",
+    )
 
 
 def judge_part(part: str, nees: Consistency) -> list[Verdict]:
     """Verdicts on errors against ground truth."""
     if nees.interval[0] <= 1.0 <= nees.interval[1]:
         return []
+    times = f"errors of {part} are {max(nees.factor, 1 / nees.factor):.2f} times"
     if nees.factor > _PART_FACTOR:
-        return [
-            _verdict(
-                "overconfident",
-                part,
-                nees,
-                f"errors of {part} are {nees.factor:.2f} times as large as predicted: its deviations are"
-                " too small",
-            )
-        ]
+        sentence = f"{times} as large as predicted: its deviations are too small"
+        return [_verdict(("overconfident", sentence), part, nees)]
     if nees.factor < 1.0 / _PART_FACTOR:
-        return [
-            _verdict(
-                "underconfident",
-                part,
-                nees,
-                f"errors of {part} are {1 / nees.factor:.2f} times smaller than predicted: noise is set"
-                " too large",
-            )
-        ]
+        sentence = f"{times} smaller than predicted: noise is set too large"
+        return [_verdict(("underconfident", sentence), part, nees)]
     return []
 
 

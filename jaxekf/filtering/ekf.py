@@ -92,9 +92,26 @@ class Instant(NamedTuple):
 
 
 class FilterOutput(NamedTuple):
-    """The results of the filter for a run."""
+    """The results of the filter for a run, with leading axes (K, S): K epochs of S substeps.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> filtered = jaxekf.jit(jaxekf.run_filter, static_argnums=0)
+    >>> output = filtered(model, model.parameters, belief, line.steps)
+    >>> output.instants.updated.mean.bias.shape, output.instants.updated.cov.shape
+    ((1501, 2, 3), (1501, 2, 6, 6))
+    >>> nis = output.innovations["optical"].nis
+    >>> print(f"{nis.sum() / output.innovations['optical'].used.sum():.2f}")
+    0.98
+    """
 
     instants: Instant
+    """Beliefs, log-likelihood and flags at the end of each substep."""
     inputs: InputSample | None
     """The input of each substep, leading axes (K, S)."""
     innovations: dict[str, Innovation]
@@ -115,6 +132,17 @@ def initial_belief(model: Model, params: Parameters, first: Mapping[str, Any]) -
     -------
     Belief
         Mean from the first samples, covariance (n, n) from ``params.initial``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> print(np.rad2deg(np.sqrt(np.diagonal(belief.cov))).round(1))  # deg and deg/s
+    [10. 10. 10.  1.  1.  1.]
     """
     return Belief(model.initial_mean(first), model.initial_covariance(params))
 
@@ -169,8 +197,9 @@ def run_filter(
     >>> model = jaxekf.get_model("loose")
     >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
     >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
-    >>> run = jaxekf.jit(lambda params: jaxekf.run_filter(model, params, belief, line.steps))
-    >>> bool(run(model.parameters).instants.healthy.all())
+    >>> filtered = jaxekf.jit(jaxekf.run_filter, static_argnums=0)
+    >>> output = filtered(model, model.parameters, belief, line.steps)
+    >>> bool(output.instants.healthy.all())
     True
     """
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, rejecting_s))
@@ -213,6 +242,27 @@ def run_filter_batch(
     ------
     ModelError
         As `run_filter`, and for no run or no step.
+
+    Examples
+    --------
+    The same run with two sizes of the tracker's noise, 0.3 and 3 deg:
+
+    >>> import jax
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> params, belief, steps = jax.tree.map(
+    ...     lambda a: np.stack([a, a]), (model.parameters, belief, line.steps)
+    ... )
+    >>> params.noise.optical[1] *= 10.0
+    >>> filtered = jaxekf.jit(jaxekf.run_filter_batch, static_argnums=0)
+    >>> output = filtered(model, params, belief, steps)
+    >>> log_likelihood = output.instants.log_likelihood.sum(axis=(1, 2))
+    >>> bool(log_likelihood[0] > log_likelihood[1])
+    True
     """
     if keep not in _SAVE_SPECS:
         raise ModelError(

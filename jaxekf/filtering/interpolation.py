@@ -10,7 +10,24 @@ from jaxekf.filtering.steps import Knots
 
 
 class InputSample(NamedTuple):
-    """The input of one step, as transition, sensors and outputs get it."""
+    """The input of one step, as transition, sensors and outputs get it.
+
+    Examples
+    --------
+    Half a turn in a second about z, by the transition of `loose`:
+
+    >>> import jax.numpy as jnp
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> rate = jnp.array([0.0, 0.0, jnp.pi])
+    >>> u = jaxekf.InputSample(mean=rate, value=rate, bandwidth=0.0)
+    >>> before = model.initial_mean({"optical": jnp.array([1.0, 0.0, 0.0, 0.0])})
+    >>> after = model.transition(before, u, 1.0, jnp.zeros(6), model.parameters)
+    >>> print(np.abs(after.q_ref_body).round(3))
+    [0. 0. 0. 1.]
+    """
 
     mean: Any
     """Mean of the linearly interpolated input over the step, (c,)."""

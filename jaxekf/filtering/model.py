@@ -27,9 +27,27 @@ Source = Callable[[Recording], Samples]
 
 
 class Start(NamedTuple):
-    """The start of a run."""
+    """The start of a run, as `Model.find_start` returns it.
+
+    Examples
+    --------
+    A model that starts at the tracker's sample number 100:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> def find_start(recording, samples):
+    ...     optical = samples["optical"]
+    ...     first = {"optical": optical.value[100]}
+    ...     return jaxekf.Start(int(optical.time_ns[100]), first, "began at sample 100")
+    >>> model = replace(jaxekf.get_model("loose"), find_start=find_start)
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> line = jaxekf.timeline.build(model, run)
+    >>> print((line.time_ns[0, -1] - run.need_optical().time_ns[0]) / 1e9, "s:", *line.notes)
+    1.6 s: began at sample 100
+    """
 
     time_ns: int
+    """First instant of the estimate, int64 nanoseconds on the recording's clock."""
     first: dict[str, Any]
     """The argument of `Model.initial_mean`."""
     note: str = ""
@@ -40,7 +58,25 @@ FindStart = Callable[[Recording, Mapping[str, Samples]], Start | None]
 
 
 class Parameters(NamedTuple):
-    """The parameters of a model: pytrees of arrays, all differentiable."""
+    """The parameters of a model: pytrees of arrays, all differentiable.
+
+    Examples
+    --------
+    Estimate with twice the model's noise of the tracker, which makes innovations smaller than predicted:
+
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> params, unit = model.parameters, model.units.noise.optical
+    >>> print(f"{params.noise.optical:.5f} {unit}")
+    0.00524 rad
+    >>> noise = params.noise._replace(optical=2.0 * params.noise.optical)
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(
+    ...     jaxekf.demo.FOLDER / "free-5", params=params._replace(noise=noise)
+    ... )
+    >>> print(f"NIS {estimate.mean_nis('optical'):.2f}")
+    NIS 0.25
+    """
 
     noise: Any
     """Standard deviations or spectral densities; shape () for all axes, (d,) for each axis, or a
@@ -57,10 +93,31 @@ class Parameters(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """A state and the covariance of its error vector (in the tangent space at the mean)."""
+    """A state and the covariance of its error vector (in the tangent space at the mean).
+
+    Examples
+    --------
+    The bias is known from a calibration, in rad/s:
+
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> line = jaxekf.timeline.build(model, jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    >>> mean = belief.mean._replace(bias=np.array([0.0123, 0.0079, -0.0004]))
+    >>> deviations = np.deg2rad([10.0, 10.0, 10.0, 0.02, 0.02, 0.02])
+    >>> belief = jaxekf.Belief(mean, np.diag(deviations**2))
+    >>> filtered = jaxekf.jit(jaxekf.run_filter, static_argnums=0)
+    >>> output = filtered(model, model.parameters, belief, line.steps)
+    >>> print(np.rad2deg(output.instants.updated.mean.bias[-1, -1]).round(2))  # deg/s
+    [ 0.7   0.45 -0.02]
+    """
 
     mean: Any
+    """The state: a NamedTuple of arrays, such as `q_ref_body` (4,) and `bias` (3,) of `loose`."""
     cov: Array
+    """(n, n) covariance of the error vector, whose rows are named by `Estimate.error_labels`."""
 
 
 @renamed_fields(aux_like="typical_aux", alike="single_group")
@@ -69,9 +126,24 @@ class Sensor:
     """One kind of measurement.
 
     ``measured = retract(predict(x, u, params, aux), noise)`` in the space of the measurement.
+
+    Examples
+    --------
+    The tracker of `loose`, and a model in which it has a chi-square gate at 99.9 %:
+
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> optical = model.sensor("optical")
+    >>> optical.rows, optical.space.unit, optical.gate
+    (3, 'rad', None)
+    >>> gated = replace(model, sensors=(replace(optical, gate=0.999),))
+    >>> gated.sensor("optical").gate
+    0.999
     """
 
     name: str
+    """Name in `Estimate.sensors` and in the account, such as ``optical``."""
     space: Any
     """Manifold (or NamedTuple of manifolds) of one sample; its error vector has one entry a row."""
     predict: Predict
@@ -169,10 +241,32 @@ def repeated(one: Sensor, count: int, labels: Sequence[str] = ()) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """A quantity computed from the state, with its uncertainty."""
+    """A quantity computed from the state, with its uncertainty.
+
+    Examples
+    --------
+    The rate of `loose` is the gyroscope's sample without the bias:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> output = model.output("rate")
+    >>> output.frame, output.space.unit
+    ('body', 'rad/s')
+    >>> x = model.initial_mean({})._replace(bias=jnp.array([0.1, 0.0, 0.0]))
+    >>> sample = jnp.array([0.5, 0.0, 0.3])
+    >>> u = jaxekf.InputSample(mean=sample, value=sample, bandwidth=125.0)
+    >>> print(output.value(x, u, model.parameters))
+    [0.4 0.  0.3]
+    >>> output.noise(u, model.parameters).shape
+    (3, 3)
+    """
 
     name: str
+    """Name in `Estimate.outputs`."""
     space: Any
+    """Manifold of the value; gives its unit and the length of its error vector."""
     frame: str
     """Frame of the error vector and its covariance."""
     value: Callable[[Any, Any, Parameters], Any]
@@ -183,10 +277,28 @@ class Output:
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """A measured quantity that drives the transition, such as an IMU's rate and specific force."""
+    """A measured quantity that drives the transition, such as an IMU's rate and specific force.
+
+    Examples
+    --------
+    The gyroscope of `loose`, whose clock may be ahead of the tracker's:
+
+    >>> import jaxekf
+    >>> model = jaxekf.get_model("loose")
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> model.input.name, model.input.source(run).value.shape
+    ('gyroscope', (3001, 3))
+    >>> params = model.parameters
+    >>> calibration = params.calibration._replace(clock_offset=0.004, clock_drift=1e-4)
+    >>> shift = model.input.shift(params._replace(calibration=calibration), 10.0)
+    >>> print(f"{shift:.3f} s ahead after 10 s")
+    0.005 s ahead after 10 s
+    """
 
     name: str
+    """Name in the account, such as ``gyroscope``."""
     source: Source
+    """``source(recording)``: the samples (N, c), none of them masked in the run."""
     clock_offset: Callable[[Parameters], Array] | None = None
     """Offset from the timeline to the input's own clock at the start of the run, seconds."""
     clock_drift: Callable[[Parameters], Array] | None = None
@@ -205,17 +317,36 @@ class Input:
 @renamed_fields(patience_s="gate_reset_after_s")
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A system to be estimated. Instances are compared by identity: build each once."""
+    """A system to be estimated. Instances are compared by identity: build each once.
+
+    Examples
+    --------
+    The state of `loose`, and the noise parameters with their units:
+
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> model = jaxekf.get_model("loose")
+    >>> model.space
+    State(q_ref_body=SO3(unit='rad'), bias=Euclidean(size=3, unit='rad/s', labels=(), frame='body'))
+    >>> model.units.noise
+    Noise(gyroscope='rad/s/sqrt(Hz)', bias_walk='rad/s^2/sqrt(Hz)', optical='rad')
+    >>> [sensor.name for sensor in model.sensors], [output.name for output in model.outputs]
+    (['optical'], ['attitude', 'rate'])
+    """
 
     name: str
+    """Name for `jaxekf.get_model`, and in files of parameters."""
     summary: str
+    """One line for lists of models."""
     space: Any
+    """The state's NamedTuple type with a manifold for each field; see `jaxekf.Manifold`."""
     transition: Transition
     """``transition(x, u, dt, w, params)``: the state ``dt`` seconds later; ``u`` is the mean of the
     input over the step (None without input) and ``w`` the process noise integrated over it."""
     process_noise: ProcessNoise
     """``process_noise(params, dt)``: covariance (n_w, n_w) of ``w``; zero at ``dt = 0``."""
     sensors: tuple[Sensor, ...]
+    """All sensors; the order has no effect."""
     parameters: Parameters
     """Defaults."""
     units: Parameters
@@ -225,6 +356,7 @@ class Model:
     initial_mean: Callable[[Mapping[str, Any]], Any]
     """``initial_mean(first)``: the state at the start from the first visible sample of each sensor."""
     initial_covariance: Callable[[Parameters], Array]
+    """``initial_covariance(params)``: (n, n), from ``params.initial``."""
     start_with: tuple[str, ...] = ()
     """Sensors that need a visible sample before the run can start."""
     find_start: FindStart | None = None
@@ -239,7 +371,9 @@ class Model:
     """Seconds of samples of a sensor outside their chi-square bound, none inside, after which the belief is
     reset (gates open, covariance grows); infinite for never."""
     input: Input | None = None
+    """The measured input; None for a model whose transition needs none."""
     outputs: tuple[Output, ...] = ()
+    """Quantities that are estimated besides the state."""
     project: Callable[[Any], Any] | None = None
     """Projects an updated mean onto a constraint that its space does not keep; None for no constraint."""
     hold_to: str | None = None

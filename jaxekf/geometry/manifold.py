@@ -25,6 +25,22 @@ class Manifold(ABC):
     """One part of a state: its storage, its error vector and its names.
 
     A new manifold defines the abstract members; the derivatives have defaults by autodiff.
+
+    Examples
+    --------
+    An angle, whose error is the shorter way around the circle:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> class Angle(jaxekf.Manifold):
+    ...     unit, dim, shape, curved = "rad", 1, (1,), False
+    ...     component_labels = error_labels = ("",)
+    ...     def retract(self, x, delta):
+    ...         return x + delta
+    ...     def local(self, x, y):
+    ...         return (y - x + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
+    >>> print(f"{Angle().local(jnp.array([3.1]), jnp.array([-3.1]))[0]:.2f} rad")
+    0.08 rad
     """
 
     unit: str
@@ -84,14 +100,47 @@ class Manifold(ABC):
         )
 
 
+class _Additive(Manifold):
+    """A part whose error is added to its stored numbers."""
+
+    @property
+    def error_labels(self) -> tuple[str, ...]:
+        return self.component_labels
+
+    @property
+    def curved(self) -> bool:
+        return False
+
+    def retract(self, x: Array, delta: Array) -> Array:
+        return x + delta
+
+    def lift(self, x: Array, delta: Array) -> Array:
+        return delta
+
+    def lower(self, x: Array, change: Array) -> Array:
+        return change
+
+
 @dataclass(frozen=True)
-class Euclidean(Manifold):
-    """A vector of `size` components with additive error."""
+class Euclidean(_Additive):
+    """A vector of `size` components with additive error.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> offset = jaxekf.Euclidean(2, "uT", labels=("east", "north"))
+    >>> offset.dim, offset.error_labels, offset.unit
+    (2, ('east', 'north'), 'uT')
+    """
 
     size: int
+    """Number of components."""
     unit: str = ""
+    """Unit of all components."""
     labels: tuple[str, ...] = ()
+    """Label of each component; by default x, y, z for three, else their numbers."""
     frame: str = "body"
+    """Frame of the vector and of its error."""
 
     @property
     def dim(self) -> int:
@@ -107,32 +156,29 @@ class Euclidean(Manifold):
             return self.labels
         return _AXES if self.size == 3 else tuple(str(i) for i in range(self.size))
 
-    @property
-    def error_labels(self) -> tuple[str, ...]:
-        return self.component_labels
-
-    @property
-    def curved(self) -> bool:
-        return False
-
-    def retract(self, x: Array, delta: Array) -> Array:
-        return x + delta
-
     def local(self, x: Array, y: Array) -> Array:
         return y - x
-
-    def lift(self, x: Array, delta: Array) -> Array:
-        return delta
-
-    def lower(self, x: Array, change: Array) -> Array:
-        return change
 
 
 @dataclass(frozen=True)
 class SO3(Manifold):
-    """A rotation stored as a unit quaternion w, x, y, z; the error is a body-frame rotation vector."""
+    """A rotation stored as a unit quaternion w, x, y, z; the error is a body-frame rotation vector.
+
+    Examples
+    --------
+    A quarter turn about z as an error of three components, and back:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> space = jaxekf.SO3()
+    >>> start = jnp.array([1.0, 0.0, 0.0, 0.0])
+    >>> turned = space.retract(start, jnp.array([0.0, 0.0, jnp.pi / 2]))
+    >>> print(turned.round(2), jnp.rad2deg(space.local(start, turned)).round(1))
+    [0.71 0.   0.   0.71] [ 0.  0. 90.]
+    """
 
     unit: str = "rad"
+    """Unit of the error vector."""
 
     @property
     def dim(self) -> int:
@@ -167,14 +213,26 @@ class SO3(Manifold):
 
 
 @dataclass(frozen=True)
-class AdditiveQuaternion(Manifold):
+class AdditiveQuaternion(_Additive):
     """A quaternion as four independent components with additive error, as in Cheng (2023).
 
     Both signs of a quaternion are the same rotation, so `local` takes the sign of ``y`` nearer to
     ``x``. The norm is not constrained here; the model's `project` normalises it.
+
+    Examples
+    --------
+    Both signs of a quaternion have no difference:
+
+    >>> import jax.numpy as jnp
+    >>> import jaxekf
+    >>> space = jaxekf.AdditiveQuaternion()
+    >>> q = jnp.array([0.6, 0.8, 0.0, 0.0])
+    >>> space.dim, bool((space.local(q, -q) == 0.0).all())
+    (4, True)
     """
 
     unit: str = ""
+    """Unit of the error vector; none."""
 
     @property
     def dim(self) -> int:
@@ -188,25 +246,8 @@ class AdditiveQuaternion(Manifold):
     def component_labels(self) -> tuple[str, ...]:
         return ("w", *_AXES)
 
-    @property
-    def error_labels(self) -> tuple[str, ...]:
-        return ("w", *_AXES)
-
-    @property
-    def curved(self) -> bool:
-        return False
-
-    def retract(self, x: Array, delta: Array) -> Array:
-        return x + delta
-
     def local(self, x: Array, y: Array) -> Array:
         return jnp.where(jnp.sum(x * y) < 0.0, -y, y) - x
-
-    def lift(self, x: Array, delta: Array) -> Array:
-        return delta
-
-    def lower(self, x: Array, change: Array) -> Array:
-        return change
 
 
 class Part(NamedTuple):
@@ -227,7 +268,15 @@ def _flatten(space: Any, *states: Any) -> tuple[list[Manifold], list[list[Array]
 
 
 def parts(space: Any) -> tuple[Part, ...]:
-    """The leaves of a space in order, with their names and slices of the error vector."""
+    """The leaves of a space in order, with their names and slices of the error vector.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> [(part.name, part.manifold.dim) for part in manifold.parts(jaxekf.get_model("loose").space)]
+    [('q_ref_body', 3), ('bias', 3)]
+    """
     found, start = [], 0
     for path, manifold in jax.tree_util.tree_flatten_with_path(space, is_leaf=_is_manifold)[0]:
         name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
@@ -237,12 +286,28 @@ def parts(space: Any) -> tuple[Part, ...]:
 
 
 def error_dim(space: Any) -> int:
-    """Length of the error vector of a space."""
+    """Length of the error vector of a space.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.error_dim(jaxekf.SO3())  # of four stored numbers
+    3
+    """
     return sum(part.manifold.dim for part in parts(space))
 
 
 def error_labels(space: Any) -> tuple[str, ...]:
-    """Name of each component of the error vector, ``bias_x`` for instance."""
+    """Name of each component of the error vector, ``bias_x`` for instance.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.error_labels(jaxekf.get_model("loose").space)[-3:]
+    ('bias_x', 'bias_y', 'bias_z')
+    """
     return tuple(
         "_".join(filter(None, (part.name, label)))
         for part in parts(space)
@@ -265,7 +330,18 @@ def error_units(space: Any) -> tuple[str, ...]:
 
 
 def retract(space: Any, x: Any, delta: Array) -> Any:
-    """``x`` moved by the error vector ``delta``, shape (error_dim,)."""
+    """``x`` moved by the error vector ``delta``, shape (error_dim,).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> delta = np.array([0.0, 0.0, np.pi / 2])  # a quarter turn about z
+    >>> moved = manifold.retract(jaxekf.SO3(), rotation.identity(), delta)
+    >>> np.allclose(moved, np.sqrt([0.5, 0.0, 0.0, 0.5]))
+    True
+    """
     manifolds, (leaves,), structure = _flatten(space, x)
     moved, start = [], 0
     for manifold, leaf in zip(manifolds, leaves, strict=True):
@@ -275,7 +351,18 @@ def retract(space: Any, x: Any, delta: Array) -> Any:
 
 
 def local(space: Any, x: Any, y: Any) -> Array:
-    """The error vector that moves ``x`` to ``y``, shape (error_dim,)."""
+    """The error vector that moves ``x`` to ``y``, shape (error_dim,).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> half_turn_about_y = np.array([0.0, 0.0, 1.0, 0.0])
+    >>> delta = manifold.local(jaxekf.SO3(), rotation.identity(), half_turn_about_y)
+    >>> np.rad2deg(delta).round(9).tolist()
+    [0.0, 180.0, 0.0]
+    """
     manifolds, (first, second), _ = _flatten(space, x, y)
     return jnp.concatenate(
         [m.local(a, b) for m, a, b in zip(manifolds, first, second, strict=True)]
@@ -283,7 +370,15 @@ def local(space: Any, x: Any, y: Any) -> Array:
 
 
 def lift(space: Any, x: Any, delta: Array) -> Any:
-    """An error vector as a change of the stored numbers of ``x`` (linear in `delta`)."""
+    """An error vector as a change of the stored numbers of ``x`` (linear in `delta`).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> manifold.lift(jaxekf.SO3(), rotation.identity(), np.array([0.0, 0.0, 0.5])).tolist()
+    [0.0, 0.0, 0.0, 0.25]
+    """
     manifolds, (leaves,), structure = _flatten(space, x)
     changes, start = [], 0
     for manifold, leaf in zip(manifolds, leaves, strict=True):
@@ -301,7 +396,15 @@ def lower(space: Any, x: Any, change: Any) -> Array:
 
 
 def is_curved(space: Any) -> bool:
-    """Whether a change of the mean changes the covariance, because a part of the space is curved."""
+    """Whether a change of the mean changes the covariance, because a part of the space is curved.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.is_curved(jaxekf.SO3()), manifold.is_curved(jaxekf.Euclidean(3))
+    (True, False)
+    """
     return any(part.manifold.curved for part in parts(space))
 
 
@@ -310,6 +413,16 @@ def reset_jacobian(space: Any, delta: Array) -> Array:
 
     To first order the error about the updated mean is ``J(delta)`` times the error about the old one (Sola,
     Deray, Atchuthan 2018, eq. 67 for rotations).
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> delta = np.array([0.0, 0.0, 0.1])
+    >>> jacobian = jax.jit(lambda delta: manifold.reset_jacobian(jaxekf.SO3(), delta))(delta)
+    >>> np.allclose(jacobian, np.eye(3) - rotation.skew(delta) / 2.0, atol=2e-3)  # the first terms
+    True
     """
     size = error_dim(space)
     rows = []

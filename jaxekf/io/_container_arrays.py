@@ -69,12 +69,9 @@ def open_container(path: Path, groups: tuple[str, ...], root: tuple[str, ...]) -
         raise
     except Exception as error:
         message = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(
-            path,
-            f"a damaged file ({message})",
-            f"a whole {form.upper()} file",
-            "copying or exporting it again",
-        ) from None
+        got = f"a damaged file ({message})"
+        expected = f"a whole {form.upper()} file"
+        raise RecordingError(path, got, expected, "copying or exporting it again") from None
 
 
 def check_sizes(path: Path, arrays: dict[str, Stored]) -> None:
@@ -134,20 +131,14 @@ def _npz_stored(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         shape, fortran, dtype = header(file)
         start = file.tell()
     if dtype.hasobject:
-        raise RecordingError(
-            f"{path}:{name}",
-            f"the type {dtype}: pickled objects, which are never loaded",
-            "numbers, flags or texts",
-            "exporting it again as such",
-        )
+        got = f"the type {dtype}: pickled objects, which are never loaded"
+        expected = "numbers, flags or texts"
+        raise RecordingError(f"{path}:{name}", got, expected, "exporting it again as such")
     size = dtype.itemsize * math.prod(shape)
     if min(shape, default=0) < 0 or info.file_size != start + size:
-        raise RecordingError(
-            f"{path}:{name}",
-            f"{info.file_size - start} bytes of data",
-            f"{size} for the shape {shape} of {dtype}",
-            "copying or exporting it again",
-        )
+        got = f"{info.file_size - start} bytes of data"
+        expected = f"{size} for the shape {shape} of {dtype}"
+        raise RecordingError(f"{path}:{name}", got, expected, "copying or exporting it again")
 
     def read() -> NDArray[Any]:
         with archive.open(info) as file:
@@ -182,12 +173,9 @@ def _follow(path: Path, node: Any, name: str, kind: type, wanted: str, key: str 
     """A group or data set of this file; links to other files are not followed."""
     place, link = f"{path}:{key or name}", node.get(name, getlink=True)
     if not isinstance(link, h5py.HardLink):
-        raise RecordingError(
-            place,
-            f"a link ({type(link).__name__})",
-            f"{wanted} in the file itself",
-            "copying what it leads to into the file (h5repack, h5copy)",
-        )
+        got = f"a link ({type(link).__name__})"
+        hint = "copying what it leads to into the file (h5repack, h5copy)"
+        raise RecordingError(place, got, f"{wanted} in the file itself", hint)
     found = node[name]
     if not isinstance(found, kind):
         raise RecordingError(
@@ -249,12 +237,8 @@ def _text(path: Path, key: str, stored: Stored) -> Any:
             return str(value)
         if isinstance(value, np.integer):
             return int(value)
-    raise RecordingError(
-        f"{path}:{key}",
-        f"{stored.dtype} of shape {stored.shape}",
-        "one text or whole number",
-        "writing it as such",
-    )
+    got = f"{stored.dtype} of shape {stored.shape}"
+    raise RecordingError(f"{path}:{key}", got, "one text or whole number", "writing it as such")
 
 
 def of_fixed_length(value: Any) -> Any:

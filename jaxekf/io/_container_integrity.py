@@ -45,12 +45,9 @@ def check_whole_zip(path: Path) -> None:
         raise RecordingError(path, "a file that is not NPZ", "an NPZ file", "another file")
     member, end = _last_member(path, there)
     detail = f", and {member} alone ends at byte {end}" if end > there else ""
-    raise RecordingError(
-        path,
-        f"a truncated file: {there} bytes without the central directory of an NPZ file{detail}",
-        f"more than {max(end, there)} bytes",
-        "copying or exporting it again",
-    )
+    got = f"a truncated file: {there} bytes without the central directory of an NPZ file{detail}"
+    expected = f"more than {max(end, there)} bytes"
+    raise RecordingError(path, got, expected, "copying or exporting it again")
 
 
 def _last_member(path: Path, there: int) -> tuple[str, int]:
@@ -84,12 +81,9 @@ def check_whole_hdf5(path: Path) -> None:
         stated, length = _superblock(view, at)
         if stated > there or there - at < _SMALLEST:
             detail = f"{stated} bytes, as its superblock states"
-            raise RecordingError(
-                path,
-                f"a truncated file: {there} bytes",
-                detail if there - at >= _SMALLEST else f"more than {at + _SMALLEST} bytes",
-                "copying or exporting it again",
-            )
+            got = f"a truncated file: {there} bytes"
+            expected = detail if there - at >= _SMALLEST else f"more than {at + _SMALLEST} bytes"
+            raise RecordingError(path, got, expected, "copying or exporting it again")
         _refuse_endless_heaps(path, view, length)
 
 
@@ -132,10 +126,7 @@ def _refuse_endless_heaps(path: Path, view: Any, length_size: int) -> None:
             number = int.from_bytes(view[here : here + 2], "little")
             step = aligned + (size + 7) // 8 * 8 if number else size
             if step == 0 or here + step > end:
-                raise RecordingError(
-                    path,
-                    f"a damaged heap of texts at byte {here}",
-                    "a whole HDF5 file",
-                    "copying or exporting it again",
-                )
+                got = f"a damaged heap of texts at byte {here}"
+                expected = "a whole HDF5 file"
+                raise RecordingError(path, got, expected, "copying or exporting it again")
             here += step

@@ -25,24 +25,21 @@ def check_names(place: str, label: str, names: set[str], fields: Mapping[str, Fi
         wrong = [f"without {', '.join(missing)}"] if missing else []
         wrong += [f"with the unknown {', '.join(unknown)}"] if unknown else []
         layout = ", ".join(key if field.needed else f"[{key}]" for key, field in fields.items())
-        raise RecordingError(
-            f"{place}:{label}",
-            f"the data sets {', '.join(sorted(names)) or 'none'}, {' and '.join(wrong)}",
-            f"{layout} (those in brackets may be left out)",
-            "adding, renaming or removing data sets",
-        )
+        got = f"the data sets {', '.join(sorted(names)) or 'none'}, {' and '.join(wrong)}"
+        expected = f"{layout} (those in brackets may be left out)"
+        hint = "adding, renaming or removing data sets"
+        raise RecordingError(f"{place}:{label}", got, expected, hint)
 
 
-def check_described(place: str, key: str, about: Mapping[str, str], field: Field) -> None:
+def check_described(place: str, key: str, about: Mapping[str, Any], field: Field) -> None:
     """Unit and frame, where stated, are those that this version reads."""
     for name, expected in field.described.items():
-        if name in about and about[name] != expected:
-            raise RecordingError(
-                f"{place}:{key}@{name}",
-                f"'{about[name]}'",
-                f"'{expected}'",
-                "converting the numbers, or leaving the attribute out where it is only another word",
+        where = f"{key}@{name}"
+        if where in about and (stated := str(about[where])) != expected:
+            hint = (
+                "converting the numbers, or leaving the attribute out where it is only another word"
             )
+            raise RecordingError(f"{place}:{where}", f"'{stated}'", f"'{expected}'", hint)
 
 
 def check_type(place: str, key: str, dtype: np.dtype, field: Field) -> None:

@@ -56,11 +56,9 @@ def read_content(path: Path, expected: str = "a CSV file of samples") -> Content
         raw = gzip.decompress(raw) if raw.startswith(_GZIP) else raw
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or error
+        hint = "checking its permissions, or copying it again"
         raise RecordingError(
-            path,
-            f"a file that cannot be read ({reason})",
-            expected,
-            "checking its permissions, or copying it again",
+            path, f"a file that cannot be read ({reason})", expected, hint
         ) from error
     data = _decoded(path, raw)
     if data.isspace():
@@ -87,12 +85,9 @@ def _decoded(path: Path, raw: bytes) -> bytes:
         try:
             raw.decode("utf-8")
         except UnicodeDecodeError as error:
+            got = f"byte 0x{raw[error.start]:02x}, which is not UTF-8"
             raise RecordingError(
-                path,
-                f"byte 0x{raw[error.start]:02x}, which is not UTF-8",
-                "UTF-8",
-                "saving as UTF-8",
-                line=raw.count(b"\n", 0, error.start) + 1,
+                path, got, "UTF-8", "saving as UTF-8", line=raw.count(b"\n", 0, error.start) + 1
             ) from None
     if b"\r" in raw:
         raw = raw.replace(b"\r\n", b"\n").replace(b"\r", b"\n")

@@ -187,13 +187,8 @@ def read_rows(
     else:
         data, lines = _without_empty_rows(_with_commas(data, delimiter), first)
     if not lines.size:
-        raise RecordingError(
-            content.path,
-            "0 samples",
-            "at least one",
-            "exporting the recording again",
-            line=header_line or None,
-        )
+        hint, line = "exporting the recording again", header_line or None
+        raise RecordingError(content.path, "0 samples", "at least one", hint, line=line)
     commas = delimiter != "," and _decimal_commas(content.path, data, lines)
     notes = [f"cells are separated by {_SEPARATED_BY[delimiter]}"] if delimiter != "," else []
     notes += ["numbers have decimal commas"] if commas else []
@@ -221,13 +216,9 @@ def _only_delimiter(content: Content, begin: int, number: int) -> str:
     head = content.data[begin : content.data.index(b"\n", begin)]
     found = [delimiter for delimiter in DELIMITERS if delimiter.encode() in head]
     if len(found) > 1:
-        raise RecordingError(
-            content.path,
-            f"a header with {' and '.join(DELIMITERS[delimiter] for delimiter in found)}",
-            "one delimiter",
-            'stating which: delimiter = ";" in its section of recording.toml',
-            line=number,
-        )
+        got = f"a header with {' and '.join(DELIMITERS[delimiter] for delimiter in found)}"
+        hint = 'stating which: delimiter = ";" in its section of recording.toml'
+        raise RecordingError(content.path, got, "one delimiter", hint, line=number)
     return found[0] if found else ","
 
 
@@ -247,12 +238,10 @@ def _decimal_commas(path: Path, data: bytes, lines: Indices) -> bool:
     if comma is None:
         return False
     if _first_number(data, b".") is not None:
+        got = "decimal commas beside points"
+        hint = "exporting with decimal points"
         raise RecordingError(
-            path,
-            "decimal commas beside points",
-            "one of them",
-            "exporting with decimal points",
-            line=int(lines[data.count(b"\n", 0, comma)]),
+            path, got, "one of them", hint, line=int(lines[data.count(b"\n", 0, comma)])
         )
     return True
 
@@ -369,13 +358,10 @@ def _rectangular(text: Text, *, may_be_cut: bool) -> Text:
             width = len(text.header)
     wrong = np.flatnonzero(widths != width)
     if wrong.size:
-        raise RecordingError(
-            text.path,
-            f"{widths[wrong[0]]} cells",
-            f"{width} as in the {'header' if text.header_line else 'first row'}",
-            "completing the row or removing it",
-            line=int(lines[wrong[0]]),
-        )
+        got = f"{widths[wrong[0]]} cells"
+        expected = f"{width} as in the {'header' if text.header_line else 'first row'}"
+        hint = "completing the row or removing it"
+        raise RecordingError(text.path, got, expected, hint, line=int(lines[wrong[0]]))
     if width > _MOST_COLUMNS:
         raise RecordingError(
             text.path, f"{width} columns", f"{_MOST_COLUMNS} at most", "leaving some out"

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf._support.errors import RecordingError
-from jaxekf.io.csv_table import Table, stamps, words
+from jaxekf.io.csv_table import Sheet, Table, stamps, words
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Indices, Intake, Part, Place
-from jaxekf.recordings.types import Flags, Floats, Times
+from jaxekf.recordings.types import Camera, Flags, Floats, Markers, Times
 
 
 class Frames(NamedTuple):
@@ -76,24 +75,38 @@ def frames(
 
 
 def part_of_each_line(
-    table: Table,
-    column: str,
-    names: tuple[str, ...],
-    unknown: Callable[[int, str], RecordingError],
+    table: Table, part: str, names: tuple[str, ...], expected: str, adding: Callable[[str], str]
 ) -> Indices:
-    """Index (lines,) into `names` of the part that each line is of, by the name in its `column`.
+    """Index (lines,) into `names` of the part that each line is of, by the name in the column `part`.
 
-    `unknown` makes the error of a row whose name is none of them.
+    The error of a name that is none of them has what is `expected`, and the remedy of `adding` it.
     """
     index = {name: i for i, name in enumerate(names)}
-    cells = words(table, column)
+    cells = words(table, part)
     kinds, which = np.unique(cells, return_inverse=True)
-    part = np.array([index.get(str(kind), -1) for kind in kinds], np.intp)[which]
-    bad = np.flatnonzero(part < 0)
+    found = np.array([index.get(str(kind), -1) for kind in kinds], np.intp)[which]
+    bad = np.flatnonzero(found < 0)
     if bad.size:
-        row = int(bad[0])
-        raise unknown(row, str(cells[row]))
-    return part
+        name = str(cells[bad[0]])
+        hint = adding(name) if name else f"naming the {part} or removing the line"
+        raise table.error(int(bad[0]), part, f"{part} '{name}'", expected, hint)
+    return found
+
+
+def part_sheet(
+    stream: Markers | Camera, part: str, columns: Sequence[str], values: Floats, *reported: str
+) -> Sheet:
+    """A line for every part of every sample: its `values` (N, M, c), blank where it is not seen, and
+    the figures that were `reported` of it, where the stream has them."""
+    names = [part, *columns]
+    blocks = [values.reshape(-1, len(columns))]
+    for key in reported:
+        if (figures := getattr(stream, key)) is not None:
+            names.append(key)
+            blocks.append(figures.reshape(-1, 1))
+    samples, count = values.shape[:2]
+    times = np.repeat(stream.time_ns, count)
+    return Sheet(names, times, np.concatenate(blocks, axis=1), stream.names * samples)
 
 
 NAMES = "printable names, without blanks at their ends, each once"

@@ -1,6 +1,6 @@
 """Entries that the section of every stream in `recording.toml` may have: its file, columns and units."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 from jaxekf._support.errors import RecordingError
 from jaxekf.io._csv_text import DELIMITERS
 from jaxekf.io.csv_table import QUATERNION, TIME_UNITS, Layout
-from jaxekf.recordings.facts import BODY_TO_REFERENCE, FILE
+from jaxekf.recordings.facts import BODY_TO_REFERENCE, wrong_entry
 from jaxekf.recordings.types import Floats
 
 COMMON = {
@@ -62,43 +62,34 @@ def check_keys(
         near = [] if key in names else get_close_matches(key, names, 1, 0.8)
         if near:
             head = f"{label}." if label else ""
-            raise RecordingError(
-                place,
-                f"{head}{key}",
-                f"{head}{near[0]}",
-                "correcting the name, or another one for a fact of your own",
-                column=f"{head}{key}",
-            )
+            got = f"{head}{key}"
+            hint = "correcting the name, or another one for a fact of your own"
+            raise RecordingError(place, got, f"{head}{near[0]}", hint, column=f"{head}{key}")
 
 
 def layout(label: str, about: Mapping[str, Any], place: Path | str) -> Layout:
     """Layout of a stream's file. Raises `RecordingError` for an entry of another form."""
 
-    def stated(key: str, kind: type, expected: str, default: Any) -> Any:
-        value = about.get(key, default)
-        if value is not default and (not isinstance(value, kind) or isinstance(value, bool)):
-            raise wrong_entry(place, label, key, value, expected)
+    def stated(key: str, kind: type, good: Callable[[Any], bool], expected: str) -> Any:
+        value = about.get(key)
+        right = isinstance(value, kind) and not isinstance(value, bool) and good(value)
+        if key in about and not right:
+            raise wrong_entry(place, f"{label}.{key}", value, expected)
         return value
 
-    file = stated("file", str, "the name of a file in the run's folder", None)
-    if file is not None and (not file or Path(file).name != file):
-        raise wrong_entry(place, label, "file", file, "the name of a file in the run's folder")
-    skip = stated("skip_lines", int, "a number of lines, 0 or more", 0)
-    if skip < 0:
-        raise wrong_entry(place, label, "skip_lines", skip, "a number of lines, 0 or more")
-    delimiter = stated("delimiter", str, "one of , ; and tab", None)
-    if delimiter is not None and delimiter not in DELIMITERS:
-        raise wrong_entry(place, label, "delimiter", delimiter, "one of , ; and tab")
-    unit = stated("time_unit", str, f"one of {', '.join(TIME_UNITS)}", "s")
-    if unit not in TIME_UNITS:
-        raise wrong_entry(place, label, "time_unit", unit, f"one of {', '.join(TIME_UNITS)}")
+    a_file = "the name of a file in the run's folder"
+    file = stated("file", str, lambda name: bool(name) and Path(name).name == name, a_file)
+    skip = stated("skip_lines", int, lambda n: n >= 0, "a number of lines, 0 or more") or 0
+    delimiter = stated("delimiter", str, lambda mark: mark in DELIMITERS, "one of , ; and tab")
+    units = f"one of {', '.join(TIME_UNITS)}"
+    unit = stated("time_unit", str, lambda unit: unit in TIME_UNITS, units) or "s"
     columns = about.get("columns")
     if isinstance(columns, list) and columns and all(isinstance(name, str) for name in columns):
         header = tuple(name.strip() for name in columns)
         return Layout(file, None, header, skip, delimiter, unit)
     if columns is not None and not _is_renaming(columns):
         expected = "our names and the file's, { time = 'theirs' }, or a list of our names"
-        raise wrong_entry(place, label, "columns", columns, expected)
+        raise wrong_entry(place, f"{label}.columns", columns, expected)
     return Layout(file, dict(columns) if columns else None, None, skip, delimiter, unit)
 
 
@@ -119,12 +110,5 @@ def turning(label: str, about: Mapping[str, Any], place: Path | str) -> Turning:
     order, direction = tuple(parts[:4]), parts[4:] or [_DIRECTIONS[0]]
     if sorted(order) != ["w", "x", "y", "z"] or direction not in ([d] for d in _DIRECTIONS):
         expected = f"'{BODY_TO_REFERENCE}', or another order, or 'reference to body'"
-        raise wrong_entry(place, label, "quaternion", value, expected)
+        raise wrong_entry(place, f"{label}.quaternion", value, expected)
     return Turning(order, direction == [_DIRECTIONS[1]])
-
-
-def wrong_entry(
-    place: Path | str, label: str, key: str, value: Any, expected: str
-) -> RecordingError:
-    name = f"{label}.{key}"
-    return RecordingError(place, f"{name} = {value!r}", expected, f"correcting {FILE}", column=name)

@@ -11,6 +11,7 @@ from typing import Any
 from jaxekf._support.errors import RecordingError
 from jaxekf.io import _temporary as temporary
 
+_OVERWRITE = "--overwrite (in Python overwrite=True)"
 _HEAD = 1000
 """Bytes at the beginning of a file that must contain its marker."""
 
@@ -26,10 +27,7 @@ def check_output(path: Path | str, marker: str, *, overwrite: bool = False) -> N
         )
     if not overwrite:
         raise RecordingError(
-            target,
-            "a path that exists",
-            "a new one",
-            "another output or --overwrite (in Python overwrite=True)",
+            target, "a path that exists", "a new one", f"another output or {_OVERWRITE}"
         )
 
 
@@ -46,16 +44,22 @@ def whole_folder(path: Path | str, marker: str, *, overwrite: bool = False) -> A
     temporary.sweep(target)
     check_output(path, marker, overwrite=overwrite)
     made = temporary.beside(target)
+    with _new_folder(made, path):
+        yield made
+        temporary.sync(made)
+        _put_folder(made, target)
+
+
+@contextmanager
+def _new_folder(made: Path, path: Path | str) -> Iterator[None]:
+    """The temporary folder `made` for the output `path`; what has not been moved at the end is gone."""
     with _named(made, Path(path)):
-        target.parent.mkdir(parents=True, exist_ok=True)
+        made.parent.mkdir(parents=True, exist_ok=True)
         try:
             made.mkdir()
-            yield made
-            temporary.sync(made)
-            _put_folder(made, target)
-        except BaseException:
+            yield
+        finally:
             shutil.rmtree(made, ignore_errors=True)
-            raise
 
 
 def _put_folder(made: Path, target: Path) -> None:
@@ -92,24 +96,19 @@ def whole_set(path: Path | str) -> Iterator[Path]:
     inside = None if fresh else target
     temporary.sweep(target, inside)
     made = temporary.beside(target, folder=inside)
-    with _named(made, Path(path)):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            made.mkdir()
-            yield made
-            temporary.sync(made)
-            if fresh:
-                _put_folder(made, target)
-                return
-            for file in sorted(made.rglob("*")):
-                place = target / file.relative_to(made)
-                if file.is_dir():
-                    place.mkdir(exist_ok=True)
-                else:
-                    file.replace(place)
-            temporary.sync_folder(target)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
+    with _new_folder(made, path):
+        yield made
+        temporary.sync(made)
+        if fresh:
+            _put_folder(made, target)
+            return
+        for file in sorted(made.rglob("*")):
+            place = target / file.relative_to(made)
+            if file.is_dir():
+                place.mkdir(exist_ok=True)
+            else:
+                file.replace(place)
+        temporary.sync_folder(target)
 
 
 @contextmanager
@@ -124,10 +123,7 @@ def whole_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         if target.is_dir():
             got = "a folder"
         elif target.is_file():
-            got, hint = (
-                "a file that exists",
-                "another path or --overwrite (in Python overwrite=True)",
-            )
+            got, hint = "a file that exists", f"another path or {_OVERWRITE}"
         raise RecordingError(target, got, "a new file", hint)
     temporary.sweep(target)
     made = temporary.beside(target, target.suffix)
@@ -178,10 +174,7 @@ def check_file(path: Path | str, marker: str, *, overwrite: bool = False) -> Non
         )
     if not overwrite:
         raise RecordingError(
-            target,
-            "a file that exists",
-            "a new one",
-            "another output or --overwrite (in Python overwrite=True)",
+            target, "a file that exists", "a new one", f"another output or {_OVERWRITE}"
         )
 
 

@@ -38,7 +38,14 @@ _LONGEST_INFO = 60_000
 
 
 def is_container(path: Path | str) -> bool:
-    """Whether a path is by its suffix (.h5, .hdf5, .npz) that of a run in one file."""
+    """Whether a path is by its suffix (.h5, .hdf5, .npz) that of a run in one file.
+
+    Examples
+    --------
+    >>> from jaxekf.io import container
+    >>> container.is_container("run.h5"), container.is_container("run")
+    (True, False)
+    """
     return Path(path).suffix.lower() in SUFFIXES
 
 
@@ -47,6 +54,19 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
 
     `load` gives every number again to the last bit, those of hidden rows too. Raises `RecordingError` where
     the file may not be written, or the run could not be read again.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jaxekf
+    >>> from jaxekf.io import container
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = container.save(run, Path(folder) / "free-5.npz")
+    ...     again = jaxekf.load(file)
+    >>> bool((again.need_imu().gyroscope == run.need_imu().gyroscope).all())
+    True
     """
     path = _known(path)
     entries = _entries(recording, path)
@@ -54,20 +74,14 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
     # Whatever `load` would refuse is refused now, by the same code.
     _check_declared(path, {key: np.asarray(value) for key, value in data.items()}, {})
     _assemble(path, entries[""].about, data, sort=False, own=True)
-    if SUFFIXES[path.suffix.lower()] == "npz":
-        entries |= {key: export.Entry(_plain(e.value), e.about) for key, e in entries.items()}
-        with whole_file(path, overwrite=overwrite) as temporary:
-            export.write_npz(temporary, entries)
-    else:
-        entries = {
-            key: export.Entry(
-                of_fixed_length(entry.value),
-                {name: of_fixed_length(attributes) for name, attributes in entry.about.items()},
-            )
-            for key, entry in entries.items()
-        }
-        with whole_file(path, overwrite=overwrite) as temporary:
-            export.write_hdf5(temporary, entries)
+    write = export.write_npz
+    if SUFFIXES[path.suffix.lower()] == "hdf5":
+        write = export.write_hdf5
+        for key, (value, about) in entries.items():
+            about = {name: of_fixed_length(attribute) for name, attribute in about.items()}
+            entries[key] = export.Entry(of_fixed_length(value), about)
+    with whole_file(path, overwrite=overwrite) as temporary:
+        write(temporary, entries)
     return path
 
 
@@ -95,12 +109,9 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
             data[key] = layout.exact(str(path), key, stored.read(), _field(key))
     own = "sha256" in attributes
     if own and attributes["sha256"] != (found := layout.content_hash(attributes, data)):
-        raise RecordingError(
-            path,
-            f"content whose SHA-256 is {found}",
-            f"{attributes['sha256']}, the attribute sha256 of the file",
-            "copying the file again; after a change on purpose delete the attribute",
-        )
+        expected = f"{attributes['sha256']}, the attribute sha256 of the file"
+        hint = "copying the file again; after a change on purpose delete the attribute"
+        raise RecordingError(path, f"content whose SHA-256 is {found}", expected, hint)
     recording = _assemble(path, attributes, data, sort=sort, own=own)
     if not own:
         recording = without_repeats(recording)
@@ -123,17 +134,12 @@ def _field(key: str) -> Field:
 def _check_root(path: Path, attributes: Mapping[str, Any]) -> None:
     for key, expected in (("kind", layout.KIND), ("schema_version", SCHEMA_VERSION)):
         if key in attributes and attributes[key] != expected:
-            raise RecordingError(
-                f"{path}@{key}",
-                f"{attributes[key]!r}",
-                f"{expected!r}",
-                "a run written for this version",
-            )
+            got, hint = f"{attributes[key]!r}", "a run written for this version"
+            raise RecordingError(f"{path}@{key}", got, f"{expected!r}", hint)
     for key in ("name", "info", "sha256"):
         if not isinstance(attributes.get(key, ""), str):
-            raise RecordingError(
-                f"{path}@{key}", f"{attributes[key]!r}", "a text", "writing it as one"
-            )
+            got = f"{attributes[key]!r}"
+            raise RecordingError(f"{path}@{key}", got, "a text", "writing it as one")
 
 
 def _check_declared(path: Path, arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> None:
@@ -146,12 +152,7 @@ def _check_declared(path: Path, arrays: Mapping[str, Any], attributes: Mapping[s
             field, stored = _field(key), arrays[key]
             layout.check_type(str(path), key, stored.dtype, field)
             layout.check_shape(str(path), key, stored.shape, field, sizes)
-            about = {
-                a: str(attributes[f"{key}@{a}"])
-                for a in ("unit", "frame")
-                if f"{key}@{a}" in attributes
-            }
-            layout.check_described(str(path), key, about, field)
+            layout.check_described(str(path), key, attributes, field)
 
 
 def _assemble(
@@ -168,9 +169,8 @@ def _assemble(
                 stream = _as_stored(stream, group)
             streams[label], accounts[label] = stream, account
     if not streams:
-        raise RecordingError(
-            path, "no stream", f"one of the groups {', '.join(STREAMS)}", "another file"
-        )
+        expected = f"one of the groups {', '.join(STREAMS)}"
+        raise RecordingError(path, "no stream", expected, "another file")
     info = _info(path, attributes.get("info", ""))
     made = Recording(str(attributes.get("name", path.stem)), info=info, path=path, intake=accounts)
     return made.with_streams(streams)
@@ -216,9 +216,8 @@ def _noted(recording: Recording, others: list[str]) -> Recording:
     first = next(iter(recording.intake))
     account = recording.intake[first]
     listed = ", ".join(sorted(others)[:10]) + (", ..." if len(others) > 10 else "")
-    account = replace(
-        account, notes=(*account.notes, f"other contents of the file are not read: {listed}")
-    )
+    note = f"other contents of the file are not read: {listed}"
+    account = replace(account, notes=(*account.notes, note))
     return recording.replace(intake={**recording.intake, first: account})
 
 
@@ -226,25 +225,19 @@ def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
     """Entries to write, by path; the root first."""
     info = dict(recording.info)
     info |= facts.known_entries(info, path)
-    attributes: dict[str, Any] = {
-        "kind": layout.KIND,
-        "schema_version": SCHEMA_VERSION,
-        "name": recording.name,
-    }
     try:
-        attributes["info"] = tomli_w.dumps(info)
-        size = len(f"{recording.name}{attributes['info']}".encode())
+        text = tomli_w.dumps(info)
+        size = len(f"{recording.name}{text}".encode())
     except (TypeError, ValueError, AttributeError) as error:
         raise RecordingError(
             path, f"info that is no TOML ({error})", "texts, numbers and lists", "changing it"
         ) from None
     if size > _LONGEST_INFO:
-        raise RecordingError(
-            path,
-            f"info of {size} bytes",
-            f"at most {_LONGEST_INFO}, which one file has room for",
-            "a folder, which has room for more",
-        )
+        expected = f"at most {_LONGEST_INFO}, which one file has room for"
+        hint = "a folder, which has room for more"
+        raise RecordingError(path, f"info of {size} bytes", expected, hint)
+    attributes = {"kind": layout.KIND, "schema_version": SCHEMA_VERSION}
+    attributes |= {"name": recording.name, "info": text}
     entries: dict[str, export.Entry] = {}
     for label, stream in recording.streams.items():
         schema = SCHEMAS[label]
@@ -254,13 +247,8 @@ def _entries(recording: Recording, path: Path) -> dict[str, export.Entry]:
                 key = f"{label}/{name}"
                 raw = np.array(value, object if field.kind == TEXT else None)
                 layout.check_type(str(path), key, raw.dtype, field)
-                entries[key] = export.Entry(
-                    layout.exact(str(path), key, raw, field), field.described
-                )
+                exact = layout.exact(str(path), key, raw, field)
+                entries[key] = export.Entry(exact, field.described)
     data = {key: entry.value for key, entry in entries.items()}
     attributes["sha256"] = layout.content_hash(attributes, data)
     return {"": export.Entry(None, attributes)} | entries
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

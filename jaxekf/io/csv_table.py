@@ -124,22 +124,13 @@ def read_table(path: Path, layout: Layout | None = None) -> Table:
     if how.columns is not None:
         names = _renamed(text, how.columns)
     if how.columns is None and how.header is None and "" in names[:-1]:
-        raise RecordingError(
-            path,
-            f"a column without a name after '{names[names.index('') - 1]}'",
-            "a name for each",
-            "naming or removing it",
-            line=text.header_line,
-        )
+        got = f"a column without a name after '{names[names.index('') - 1]}'"
+        expected = "a name for each"
+        raise RecordingError(path, got, expected, "naming or removing it", line=text.header_line)
     known = [name for name in names if name]
     if len(set(known)) != len(known):
-        raise RecordingError(
-            path,
-            f"columns {','.join(text.header)}",
-            "each once",
-            "renaming one",
-            line=text.header_line,
-        )
+        got = f"columns {','.join(text.header)}"
+        raise RecordingError(path, got, "each once", "renaming one", line=text.header_line)
     return Table(path, names, text, how.time_unit)
 
 
@@ -147,22 +138,15 @@ def _renamed(text: Text, columns: Mapping[str, str]) -> tuple[str, ...]:
     """This package's name of each of the file's columns; blank for a column that is not read."""
     missing = [theirs for theirs in columns.values() if theirs not in text.header]
     if missing:
-        raise RecordingError(
-            text.path,
-            f"columns {','.join(text.header)}",
-            f"among them {','.join(missing)}, as recording.toml states",
-            "correcting the names under columns in recording.toml",
-            line=text.header_line,
-        )
+        got = f"columns {','.join(text.header)}"
+        expected = f"among them {','.join(missing)}, as recording.toml states"
+        hint = "correcting the names under columns in recording.toml"
+        raise RecordingError(text.path, got, expected, hint, line=text.header_line)
     ours = {theirs: name for name, theirs in columns.items()}
     if len(ours) != len(columns) or any(text.header.count(theirs) > 1 for theirs in ours):
-        raise RecordingError(
-            text.path,
-            f"columns {','.join(text.header)} for {', '.join(columns.values())}",
-            "each of them once",
-            "correcting the names under columns in recording.toml",
-            line=text.header_line,
-        )
+        got = f"columns {','.join(text.header)} for {', '.join(columns.values())}"
+        hint = "correcting the names under columns in recording.toml"
+        raise RecordingError(text.path, got, "each of them once", hint, line=text.header_line)
     return tuple(ours.get(name, "") for name in text.header)
 
 
@@ -193,13 +177,10 @@ def need_columns(table: Table, *layouts: str) -> None:
 def need_time(table: Table) -> None:
     """Raise unless there is a column ``time``."""
     if "time" not in table.columns:
-        raise RecordingError(
-            table.path,
-            f"columns {','.join(table.columns)}",
-            "one of the name time",
-            "adding or renaming it",
-            line=table.text.header_line,
-        )
+        got = f"columns {','.join(table.columns)}"
+        expected = "one of the name time"
+        hint = "adding or renaming it"
+        raise RecordingError(table.path, got, expected, hint, line=table.text.header_line)
 
 
 def numbers(table: Table, names: Sequence[str], *, blank: bool = False) -> Floats:
@@ -278,13 +259,9 @@ def whole_or_blank(table: Table, names: Sequence[str]) -> Floats:
     if bad.size:
         row = int(bad[0])
         cells = [table.cell(row, name) for name in names]
-        raise table.error(
-            row,
-            ",".join(names),
-            f"'{','.join(cells)}'",
-            f"{len(names)} finite numbers, or {len(names)} blank cells for unknown values",
-            "completing or blanking them",
-        )
+        got = f"'{','.join(cells)}'"
+        expected = f"{len(names)} finite numbers, or {len(names)} blank cells for unknown values"
+        raise table.error(row, ",".join(names), got, expected, "completing or blanking them")
     return values
 
 
@@ -296,13 +273,9 @@ def reported(table: Table, name: str, least: float = -np.inf) -> Floats | None:
     bad = np.flatnonzero(np.isinf(values) | (values < least))
     if bad.size:
         row = int(bad[0])
-        raise table.error(
-            row,
-            name,
-            f"{values[row]}",
-            "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more",
-            "blanking the cell, which means that no value was reported",
-        )
+        expected = "a finite number" if np.isinf(least) else f"a finite number, {least:g} or more"
+        hint = "blanking the cell, which means that no value was reported"
+        raise table.error(row, name, f"{values[row]}", expected, hint)
     return values
 
 
@@ -370,26 +343,21 @@ def _no_time(table: Table, row: int) -> RecordingError:
     return table.error(row, "time", f"'{cell}'", f"a time in {expected}, within 292 years", hint)
 
 
-def read_times(table: Table, *, repeated: bool = False) -> Times:
-    """The column ``time`` (N,), which increases; with `repeated`, consecutive rows may share a time."""
+def read_times(table: Table) -> Times:
+    """The column ``time`` (N,), which increases."""
     times = stamps(table)
-    check_increasing(table, times, repeated=repeated)
+    check_increasing(table, times)
     return times
 
 
-def check_increasing(table: Table, times: Times, *, repeated: bool = False) -> None:
-    """Raise at the first time (N,) that does not increase; with `repeated`, at the first that decreases."""
-    step = np.diff(times)
-    backwards = np.flatnonzero(step < 0 if repeated else step <= 0)
+def check_increasing(table: Table, times: Times) -> None:
+    """Raise at the first time (N,) that does not increase."""
+    backwards = np.flatnonzero(np.diff(times) <= 0)
     if backwards.size:
         i = int(backwards[0]) + 1
-        raise table.error(
-            i,
-            "time",
-            f"{table.cell(i, 'time')} after {table.cell(i - 1, 'time')}",
-            "times that do not decrease" if repeated else "times that increase",
-            "sorting the rows" if repeated else "sorting the rows and removing duplicates",
-        )
+        got = f"{table.cell(i, 'time')} after {table.cell(i - 1, 'time')}"
+        hint = "sorting the rows and removing duplicates"
+        raise table.error(i, "time", got, "times that increase", hint)
 
 
 def flags(table: Table, name: str) -> NDArray[np.bool_]:

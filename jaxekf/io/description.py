@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.recordings.facts import FILE, as_number, finite_number
+from jaxekf.recordings.facts import FILE, as_number, finite_number, wrong_entry
 from jaxekf.recordings.types import NANOSECONDS
 
 SCHEMA_VERSION = 1
 LANDMARKS = "landmarks.csv"
 """The places of what `camera.csv` names."""
-_MENDING = f"correcting {FILE}"
 _LONGEST_LATENCY_S = 3600.0
 
 
@@ -34,13 +33,9 @@ def read_description(folder: Path) -> dict[str, Any]:
         ) from error
     version = about.get("schema_version")
     if version != SCHEMA_VERSION:
-        raise RecordingError(
-            file,
-            f"schema_version {version!r}",
-            f"{SCHEMA_VERSION}",
-            "a run written for this version",
-            column="schema_version",
-        )
+        got = f"schema_version {version!r}"
+        hint = "a run written for this version"
+        raise RecordingError(file, got, f"{SCHEMA_VERSION}", hint, column="schema_version")
     return about
 
 
@@ -58,20 +53,13 @@ class Source(NamedTuple):
 def check_section(file: Path, label: str, section: Any, known: Mapping[str, str]) -> None:
     """A stated kind and frame are those that this version reads."""
     if not isinstance(section, dict):
-        raise RecordingError(
-            file, f"{label} = {section!r}", "a section", f"[{label}]", column=label
-        )
+        raise wrong_entry(file, label, section, "a section", f"[{label}]")
     for key, expected in known.items():
         if key in ("unit", "quaternion"):
             continue  # `stated` reads these.
         if key in section and section[key] != expected:
-            raise RecordingError(
-                file,
-                f"{label}.{key} = {section[key]!r}",
-                f"'{expected}'",
-                "converting the file",
-                column=f"{label}.{key}",
-            )
+            hint = "converting the file"
+            raise wrong_entry(file, f"{label}.{key}", section[key], f"'{expected}'", hint)
 
 
 def words(
@@ -81,8 +69,7 @@ def words(
     value = about.get(key, list(default))
     value = value if isinstance(value, list) else [value]
     if not all(isinstance(word, str | int | float) for word in value) or not value:
-        name = f"{label}.{key}"
-        raise RecordingError(place, f"{name} = {value!r}", "words", f'{key} = ["ok"]', column=name)
+        raise wrong_entry(place, f"{label}.{key}", value, "words", f'{key} = ["ok"]')
     return [str(word) for word in value]
 
 
@@ -92,10 +79,7 @@ def limit(about: Mapping[str, Any], label: str, key: str, place: Path | str) -> 
         return math.inf
     value = finite_number(about[key], place, f"{label}.{key}")
     if value <= 0.0:
-        name = f"{label}.{key}"
-        raise RecordingError(
-            place, f"{name} = {value!r}", "a positive number", _MENDING, column=name
-        )
+        raise wrong_entry(place, f"{label}.{key}", value, "a positive number")
     return value
 
 
@@ -104,14 +88,8 @@ def latency_ns(about: Mapping[str, Any], label: str, place: Path | str) -> int:
     value = about.get("latency", 0.0)
     seconds = as_number(value)
     if seconds is None or not 0.0 <= seconds <= _LONGEST_LATENCY_S:
-        key = f"{label}.latency"
-        raise RecordingError(
-            place,
-            f"{key} = {value!r}",
-            f"finite seconds, 0 or more, {_LONGEST_LATENCY_S:g} at most",
-            _MENDING,
-            column=key,
-        )
+        expected = f"finite seconds, 0 or more, {_LONGEST_LATENCY_S:g} at most"
+        raise wrong_entry(place, f"{label}.latency", value, expected)
     return round(seconds * NANOSECONDS)
 
 

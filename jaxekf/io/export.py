@@ -36,7 +36,14 @@ class Entry(NamedTuple):
 
 
 def format_of(path: Path | str) -> str:
-    """The format of a file by its suffix: csv, npz, hdf5 or tum."""
+    """The format of a file by its suffix: csv, npz, hdf5 or tum.
+
+    Examples
+    --------
+    >>> from jaxekf.io import export
+    >>> export.format_of("estimate.npz"), export.format_of("estimate.h5")
+    ('npz', 'hdf5')
+    """
     suffix = Path(path).suffix
     if suffix.lower() not in _SUFFIXES:
         raise RecordingError(
@@ -50,12 +57,9 @@ def files_of(folder: Path | str, formats: Iterable[str]) -> dict[str, str]:
     wanted = list(dict.fromkeys(formats))
     for name in wanted:
         if name not in FILES:
-            raise RecordingError(
-                folder,
-                f"the format '{name}'",
-                f"one of {', '.join(FILES)}",
-                "one of these (estimate.csv is always there)",
-            )
+            expected = f"one of {', '.join(FILES)}"
+            hint = "one of these (estimate.csv is always there)"
+            raise RecordingError(folder, f"the format '{name}'", expected, hint)
     return {name: FILES[name] for name in wanted}
 
 
@@ -71,7 +75,7 @@ def write_npz(path: Path, entries: Mapping[str, Entry]) -> None:
 
 def _array(value: Any) -> Any:
     # Without its type a list of no texts would become numbers.
-    return np.array(value, str) if isinstance(value, list) else np.asarray(value)
+    return np.array(value, str) if isinstance(value, list | tuple) else np.asarray(value)
 
 
 def write_hdf5(path: Path, entries: Mapping[str, Entry]) -> None:
@@ -104,6 +108,18 @@ def write_tum(
     `q_ref_body` (N, 4) is w, x, y, z and `position` (N, 3) in metres, zero where there is none. Times are
     seconds with nine decimals, exact; other numbers have 17 digits, which lose nothing. Instants whose
     pose is not finite have no line; a comment at the head has their number.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from jaxekf.io import export
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "trajectory.txt"
+    ...     export.write_tum(file, np.array([1_500_000_000]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    ...     print(file.read_text("utf-8").splitlines()[-1])
+    1.500000000 0 0 0 0 0 0 1
     """
     notes = ["timestamp tx ty tz qx qy qz qw (s, m, body to reference)", *comments]
     if position is None:
@@ -138,6 +154,19 @@ def read_export(path: Path | str) -> dict[str, Any]:
     ------
     RecordingError
         For a file that `Estimate.export` has not written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf
+    >>> jaxekf.set_up()
+    >>> estimate = jaxekf.estimate(jaxekf.demo.FOLDER / "free-5")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     found = jaxekf.read_export(estimate.export(folder + "/estimate.npz"))
+    >>> found["model"], found["state/bias"].shape, found["state/bias@unit"]
+    ('loose', (3001, 3), 'rad/s')
+    >>> bool((found["time_ns"] == estimate.time_ns).all())
+    True
     """
     form = format_of(path)
     if form not in ("npz", "hdf5"):
@@ -152,12 +181,8 @@ def read_export(path: Path | str) -> dict[str, Any]:
         ) from error
     attribute = (found.get("kind"), found.get("schema_version"))
     if attribute != (KIND, SCHEMA_VERSION):
-        raise RecordingError(
-            path,
-            f"kind and schema_version {attribute}",
-            str((KIND, SCHEMA_VERSION)),
-            "exporting again with this version",
-        )
+        got, expected = f"kind and schema_version {attribute}", str((KIND, SCHEMA_VERSION))
+        raise RecordingError(path, got, expected, "exporting again with this version")
     return found
 
 

@@ -78,14 +78,9 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
     about = description.read_description(folder)
     place = folder / facts.FILE
     section_entries.check_keys(about, "", place, run_keys())
-    if not isinstance(about.get("trust_units", False), bool):
-        raise RecordingError(
-            place,
-            f"trust_units = {about['trust_units']!r}",
-            "true or false",
-            "correcting it",
-            column="trust_units",
-        )
+    if not isinstance(trusted := about.get("trust_units", False), bool):
+        hint = "correcting it"
+        raise facts.wrong_entry(place, "trust_units", trusted, "true or false", hint)
     hashes = _hashes(about, place)
     read: dict[str, Any] = {}
     accounts: dict[str, Intake] = {}
@@ -127,21 +122,12 @@ def _hashes(about: Mapping[str, Any], place: Path) -> dict[str, str]:
     """Hashes of a run's files in ``[sha256]``, by name."""
     hashes = about.get("sha256", {})
     if not isinstance(hashes, dict) or not all(isinstance(v, str) for v in hashes.values()):
-        raise RecordingError(
-            place,
-            f"sha256 = {hashes!r}",
-            "a section with a hash for each file",
-            "correcting or removing it",
-            column="sha256",
-        )
+        expected, hint = "a section with a hash for each file", "correcting or removing it"
+        raise facts.wrong_entry(place, "sha256", hashes, expected, hint)
     for name in hashes:
         if not (place.parent / name).is_file():
-            raise RecordingError(
-                place,
-                f"a hash of {name}, which is not there",
-                "one of each file",
-                "correcting its name",
-            )
+            got = f"a hash of {name}, which is not there"
+            raise RecordingError(place, got, "one of each file", "correcting its name")
     return hashes
 
 
@@ -157,7 +143,15 @@ def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
 
 
 def load_imu(path: Path | str) -> Recording:
-    """An IMU alone, from a CSV file with the columns of `imu.csv`."""
+    """An IMU alone, from a CSV file with the columns of `imu.csv`.
+
+    Examples
+    --------
+    >>> import jaxekf, jaxekf.io
+    >>> run = jaxekf.io.load_imu(jaxekf.demo.FOLDER / "free-5" / "imu.csv")
+    >>> list(run.streams), run.need_imu().gyroscope.shape  # rad/s
+    (['imu'], (3001, 3))
+    """
     file = Path(path)
     table = read_table(file)
     imu, account = SCHEMAS["imu"].read_table(table, Source({}, file, False))
@@ -166,7 +160,16 @@ def load_imu(path: Path | str) -> Recording:
 
 
 def read_log(path: Path | str) -> Recording:
-    """A recorded run, or a CSV file with the columns of `imu.csv`."""
+    """A recorded run, or a CSV file with the columns of `imu.csv`.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.io import run_folder
+    >>> folder = jaxekf.demo.FOLDER / "free-5"
+    >>> [list(run_folder.read_log(path).streams) for path in (folder, folder / "imu.csv")]
+    [['optical', 'imu', 'encoder'], ['imu']]
+    """
     alone = Path(path).is_file() and not container.is_container(path)
     return load_imu(path) if alone else load(path)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxekf._support.constants import STANDARD_GRAVITY
-from jaxekf.io._section_entries import wrong_entry
+from jaxekf.recordings.facts import wrong_entry
 from jaxekf.recordings.types import Floats
 
 UNITS: Mapping[str, dict[str, float]] = {
@@ -26,7 +26,14 @@ def factors(
     label: str, units: Sequence[str], about: Mapping[str, Any], place: Path | str
 ) -> tuple[float, ...]:
     """Size of each stated unit, ``unit = "deg/s, g"``, in the SI `units` of a stream; 1 where none is
-    stated."""
+    stated.
+
+    Examples
+    --------
+    >>> from jaxekf.io import units
+    >>> units.factors("optical", ["m"], {"unit": "mm"}, "recording.toml")
+    (0.001,)
+    """
     known = [UNITS.get(unit, {unit: 1.0}) for unit in units]
     value = about.get("unit")
     parts = [part.strip() for part in value.split(",")] if isinstance(value, str) else []
@@ -34,7 +41,7 @@ def factors(
     # Further units, such as a magnetometer's, are not used.
     if value is not None and (not parts or not good):
         expected = ", then ".join(" or ".join(choices) for choices in known)
-        raise wrong_entry(place, label, "unit", value, expected)
+        raise wrong_entry(place, f"{label}.unit", value, expected)
     stated = [choices[part] for part, choices in zip(parts, known, strict=False)]
     return (*stated, *[1.0] * (len(known) - len(stated)))
 

@@ -7,6 +7,7 @@ from jaxekf.filtering.model import Output
 from jaxekf.geometry.manifold import SO3, Euclidean
 
 METRES = Euclidean(3, "m", frame="reference")
+RATE = Euclidean(3, "rad/s")
 METRES_PER_SECOND = Euclidean(3, "m/s", frame="reference")
 
 POSITION = Output("position", METRES, "reference", lambda x, u, params: x.position)
@@ -19,4 +20,4 @@ def rate(value: Callable[..., Any], noise: Callable[..., Any] | None = None) -> 
 
     `noise` is the covariance (3, 3) by the input's own noise, ``noise(u, params)``.
     """
-    return Output("rate", Euclidean(3, "rad/s"), "body", value, noise)
+    return Output("rate", RATE, "body", value, noise)

@@ -155,14 +155,13 @@ def initial_covariance(params: Parameters) -> Array:
 
 def initial_mean(first: Any) -> State:
     """Pose and velocity of the start (the origin without any), zero biases."""
-    zero = jnp.zeros(3)
-    return State(
-        jnp.asarray(first.get("position", zero)),
-        jnp.asarray(first.get("q_ref_body", rotation.identity())),
-        jnp.asarray(first.get("velocity", zero)),
-        zero,
-        zero,
-    )
+    return state_from(State, first)
+
+
+def state_from(kind: Any, first: Any) -> Any:
+    """A state of the values in `first` by name; without one the identity for the attitude, else zero."""
+    blank = dict.fromkeys(kind._fields, jnp.zeros(3)) | {"q_ref_body": rotation.identity()}
+    return kind(*(jnp.asarray(first.get(name, value)) for name, value in blank.items()))
 
 
 def gravity(recording: Recording, raw: Callable[[], Optical]) -> Floats:

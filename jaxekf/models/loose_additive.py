@@ -25,7 +25,7 @@ from jax import Array
 
 from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg, rotation
-from jaxekf.geometry.manifold import AdditiveQuaternion, Euclidean
+from jaxekf.geometry.manifold import AdditiveQuaternion
 from jaxekf.models import _outputs, loose, sources
 
 
@@ -64,7 +64,7 @@ class Initial(NamedTuple):
     bias: Any
 
 
-SPACE: Any = State(AdditiveQuaternion(), Euclidean(3, "rad/s"), Euclidean(3, "rad/s"))
+SPACE: Any = State(AdditiveQuaternion(), _outputs.RATE, _outputs.RATE)
 
 
 def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
@@ -147,13 +147,7 @@ MODEL = Model(
             optical_noise,
             sources.optical_attitude,
         ),
-        Sensor(
-            "gyroscope",
-            Euclidean(3, "rad/s"),
-            predict_gyroscope,
-            gyroscope_noise,
-            sources.gyroscope,
-        ),
+        Sensor("gyroscope", _outputs.RATE, predict_gyroscope, gyroscope_noise, sources.gyroscope),
     ),
     parameters=DEFAULTS,
     units=UNITS,
@@ -161,10 +155,7 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=initial_covariance,
     start_with=("optical",),
-    outputs=(
-        _outputs.ATTITUDE,
-        _outputs.rate(rate_body),
-    ),
+    outputs=(_outputs.ATTITUDE, _outputs.rate(rate_body)),
     project=project,
     hold_to="optical",
 )

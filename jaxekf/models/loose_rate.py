@@ -24,7 +24,7 @@ from jax import Array
 from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.model import Model, Parameters, Sensor
 from jaxekf.geometry import linalg
-from jaxekf.geometry.manifold import SO3, Euclidean
+from jaxekf.geometry.manifold import SO3
 from jaxekf.models import _outputs, inertial, loose, sources
 
 
@@ -61,7 +61,7 @@ class Initial(NamedTuple):
     bias: Any
 
 
-SPACE: Any = State(SO3(), Euclidean(3, "rad/s"), Euclidean(3, "rad/s"))
+SPACE: Any = State(SO3(), _outputs.RATE, _outputs.RATE)
 
 
 def transition(x: State, u: Any, dt: Array, w: Array, params: Parameters) -> State:
@@ -123,13 +123,7 @@ MODEL = Model(
         Sensor(
             "optical", SO3(), loose.predict_optical, loose.optical_noise, sources.optical_attitude
         ),
-        Sensor(
-            "gyroscope",
-            Euclidean(3, "rad/s"),
-            predict_gyroscope,
-            gyroscope_noise,
-            sources.gyroscope,
-        ),
+        Sensor("gyroscope", _outputs.RATE, predict_gyroscope, gyroscope_noise, sources.gyroscope),
     ),
     parameters=DEFAULTS,
     units=UNITS,
@@ -137,10 +131,7 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
-    outputs=(
-        _outputs.ATTITUDE,
-        _outputs.rate(lambda x, u, params: x.rate),
-    ),
+    outputs=(_outputs.ATTITUDE, _outputs.rate(lambda x, u, params: x.rate)),
 )
 
 

@@ -235,16 +235,7 @@ def setup(recording: Recording) -> Setup:
 
 def initial_mean(first: Mapping[str, Any]) -> State:
     """State of the start (at rest at the origin without one), zero biases."""
-    zero = jnp.zeros(3)
-    return State(
-        jnp.asarray(first.get("position", zero)),
-        jnp.asarray(first.get("velocity", zero)),
-        jnp.asarray(first.get("acceleration", zero)),
-        jnp.asarray(first.get("q_ref_body", rotation.identity())),
-        jnp.asarray(first.get("rate", zero)),
-        zero,
-        zero,
-    )
+    return inertial.state_from(State, first)
 
 
 def adapt(bilinear: bool, recordings: Sequence[Recording]) -> Model:
@@ -318,6 +309,10 @@ OUTPUTS = (
 )
 
 
+def _imu_sensor(name: str, unit: str, predict: Any, source: Any) -> Sensor:
+    return Sensor(name, Euclidean(3, unit), predict, partial(_density, name), source)
+
+
 def _point(count: int, bilinear: bool) -> Sensor:
     """One correspondence."""
     place = np.array([0.0, 0.0, 2.0])
@@ -345,20 +340,8 @@ def _build(count: int, bilinear: bool) -> Model:
         transition=transition,
         process_noise=process_noise,
         sensors=(
-            Sensor(
-                "accelerometer",
-                Euclidean(3, "m/s^2"),
-                predict_accelerometer,
-                partial(_density, "accelerometer"),
-                accelerometer,
-            ),
-            Sensor(
-                "gyroscope",
-                Euclidean(3, "rad/s"),
-                predict_gyroscope,
-                partial(_density, "gyroscope"),
-                sources.gyroscope,
-            ),
+            _imu_sensor("accelerometer", "m/s^2", predict_accelerometer, accelerometer),
+            _imu_sensor("gyroscope", "rad/s", predict_gyroscope, sources.gyroscope),
             repeated(_point(count, bilinear), count, labels),
         ),
         parameters=DEFAULTS,

@@ -67,6 +67,16 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
         (N, M, 3) metres, reference frame.
     usable
         (N, M) visible markers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.pose_solvers import marker_pose
+    >>> p_body_marker = 0.1 * np.eye(3)
+    >>> turned = p_body_marker[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]  # a quarter turn about z
+    >>> pose = marker_pose.absolute_orientation(p_body_marker, turned[None], np.ones((1, 3), bool))
+    >>> np.allclose(pose.q_ref_body, np.sqrt([0.5, 0.0, 0.0, 0.5])), bool(pose.valid[0])
+    (True, True)
     """
     usable = usable & np.isfinite(position).all(axis=2)
     count = usable.sum(axis=1)
@@ -108,12 +118,9 @@ def fit_markers(markers: Markers, place: object) -> MarkerPose:
     size = float(np.ptp(markers.p_body_marker, axis=0).max())
     off = float(np.median(fit.error[fit.valid]))
     if off > _LARGEST_MISFIT * size:
-        raise RecordingError(
-            str(place),
-            f"markers that are {off:.3g} m off a tool of {size:.3g} m in the best pose",
-            f"at most {_LARGEST_MISFIT * size:.2g} m",
-            "metres in markers.csv and in its geometry, and each marker under its own name",
-        )
+        got = f"markers that are {off:.3g} m off a tool of {size:.3g} m in the best pose"
+        hint = "metres in markers.csv and in its geometry, and each marker under its own name"
+        raise RecordingError(str(place), got, f"at most {_LARGEST_MISFIT * size:.2g} m", hint)
     return fit
 
 
@@ -129,13 +136,8 @@ def from_markers(markers: Markers, fit: MarkerPose | None = None) -> Optical:
     """
     if fit is None:
         fit = absolute_orientation(markers.p_body_marker, markers.position, markers.usable)
-    return Optical(
-        markers.time_ns,
-        fit.q_ref_body,
-        fit.valid,
-        fit.position,
-        latency_ns=markers.latency_ns,
-    )
+    late = markers.latency_ns
+    return Optical(markers.time_ns, fit.q_ref_body, fit.valid, fit.position, latency_ns=late)
 
 
 def velocity_at(times: Times, position: Floats, valid: Flags, first: int) -> Floats:
@@ -219,12 +221,10 @@ def gravity(optical: Optical, imu: Imu, place: object) -> Floats:
         total += stop - start - gained
         lasted += seconds[-1] - seconds[0]
     if lasted == 0.0:
-        raise RecordingError(
-            str(place),
-            f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from",
-            "one, or gravity_ref = [x, y, z] in recording.toml",
-            "stating the gravity vector in the reference frame of the poses",
-        )
+        got = f"no stretch of {_LEAST_GRAVITY_S} s with poses to find gravity from"
+        expected = "one, or gravity_ref = [x, y, z] in recording.toml"
+        hint = "stating the gravity vector in the reference frame of the poses"
+        raise RecordingError(str(place), got, expected, hint)
     return total / lasted
 
 

@@ -163,13 +163,8 @@ def no_pose_error(place: Path | str, images: int) -> RecordingError:
 def as_optical(camera: Camera, most: int | None = None) -> Optical:
     """The pose of every image, or of about `most` images, as a tracker would report it; see `poses`."""
     found = poses(camera, most)
-    return Optical(
-        camera.time_ns,
-        found.q_ref_body,
-        found.valid,
-        found.position,
-        latency_ns=camera.latency_ns,
-    )
+    late = camera.latency_ns
+    return Optical(camera.time_ns, found.q_ref_body, found.valid, found.position, latency_ns=late)
 
 
 class _Points(NamedTuple):
@@ -282,11 +277,7 @@ def _direct_linear_transform(direction: Floats, place: Floats) -> tuple[Floats, 
     middle = place.mean(axis=0)
     size = np.sqrt(np.mean((place - middle) ** 2)) + 1e-12
     scaled = np.concatenate([(place - middle) / size, np.ones((len(place), 1))], axis=1)
-    zero = np.zeros_like(scaled)
-    first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
-    second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
-    matrix = _null_vector(np.concatenate([first, second])).reshape(3, 4)
-    matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
+    matrix = _ray_matrix(scaled, direction)
     if np.linalg.det(matrix[:, :3]) <= 0.0:
         return None
     # A determinant that is 0 but for rounding, as of a subset in one plane, may hide a reflection.
@@ -302,11 +293,7 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     inside = (place - middle) @ axes[:2].T
     size = np.sqrt(np.mean(inside**2)) + 1e-12
     scaled = np.concatenate([inside / size, np.ones((len(place), 1))], axis=1)
-    zero = np.zeros_like(scaled)
-    first = np.concatenate([scaled, zero, -direction[:, :1] * scaled], axis=1)
-    second = np.concatenate([zero, scaled, -direction[:, 1:] * scaled], axis=1)
-    matrix = _null_vector(np.concatenate([first, second])).reshape(3, 3)
-    matrix = matrix * np.sign(np.mean(scaled @ matrix[2]) or 1.0)
+    matrix = _ray_matrix(scaled, direction)
     length = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
     if length <= 1e-12:
         return None
@@ -317,9 +304,15 @@ def _homography(direction: Floats, place: Floats) -> tuple[Floats, Floats] | Non
     return towards.T, middle - size * towards.T @ matrix[:, 2] / length
 
 
-def _null_vector(matrix: Floats) -> Floats:
-    """Right singular vector of the smallest singular value."""
-    return np.linalg.eigh(matrix.T @ matrix)[1][:, 0]
+def _ray_matrix(places: Floats, direction: Floats) -> Floats:
+    """The matrix (3, c) that takes homogeneous places (M, c) to their rays, by least squares."""
+    zero = np.zeros_like(places)
+    first = np.concatenate([places, zero, -direction[:, :1] * places], axis=1)
+    second = np.concatenate([zero, places, -direction[:, 1:] * places], axis=1)
+    system = np.concatenate([first, second])
+    # The right singular vector of the smallest singular value.
+    matrix = np.linalg.eigh(system.T @ system)[1][:, 0].reshape(3, -1)
+    return matrix * np.sign(np.mean(places @ matrix[2]) or 1.0)
 
 
 # --- Gauss-Newton --------------------------------------------------------------------------------------

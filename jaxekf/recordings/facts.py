@@ -14,14 +14,20 @@ from jaxekf.recordings.types import Floats
 FILE = "recording.toml"
 """The description of a run in a folder."""
 BODY_TO_REFERENCE = "w,x,y,z, body to reference"
-_MENDING = f"correcting {FILE}"
+
+
+def wrong_entry(
+    place: Path | str, key: str, value: Any, expected: str, hint: str = f"correcting {FILE}"
+) -> RecordingError:
+    """The error of an entry, by its whole name."""
+    return RecordingError(place, f"{key} = {value!r}", expected, hint, column=key)
 
 
 def finite_number(value: Any, place: Path | str, key: str) -> float:
     """A finite number."""
     number = as_number(value)
     if number is None:
-        raise RecordingError(place, f"{key} = {value!r}", "a finite number", _MENDING, column=key)
+        raise wrong_entry(place, key, value, "a finite number")
     return number
 
 
@@ -29,9 +35,7 @@ def finite_vector(value: Any, size: int, place: Path | str, key: str) -> Floats:
     """A vector (size,) of finite numbers."""
     vector = _vector(value, size)
     if vector is None:
-        raise RecordingError(
-            place, f"{key} = {value!r}", f"{size} finite numbers", _MENDING, column=key
-        )
+        raise wrong_entry(place, key, value, f"{size} finite numbers")
     return vector
 
 
@@ -39,13 +43,7 @@ def nonzero_vector(value: Any, size: int, place: Path | str, key: str) -> Floats
     """A vector (size,) of finite numbers that has a length, and so a direction."""
     vector = _vector(value, size)
     if vector is None or np.linalg.norm(vector) < 1e-9:
-        raise RecordingError(
-            place,
-            f"{key} = {value!r}",
-            f"{size} finite numbers, not all 0",
-            _MENDING,
-            column=key,
-        )
+        raise wrong_entry(place, key, value, f"{size} finite numbers, not all 0")
     return vector
 
 

@@ -86,6 +86,19 @@ def split_at_gaps(recording: Recording) -> tuple[list[Recording], list[Recording
         the run itself if it has no gap or no IMU.
     list of Recording
         The parts that cannot be estimated: shorter than 0.5 s, or without a sample of tracker or camera.
+
+    Examples
+    --------
+    The IMU has no samples for 0.8 s:
+
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> imu = run.need_imu()
+    >>> run = run.replace(imu=imu.take(np.r_[:1000, 1100:3001]))
+    >>> parts, left_out = jaxekf.split_at_gaps(run)
+    >>> [part.name for part in parts], left_out
+    (['free-5-part1', 'free-5-part2'], [])
     """
     if recording.imu is None:
         return [recording], []

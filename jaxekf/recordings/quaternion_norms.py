@@ -16,7 +16,7 @@ def whole(values: Floats) -> Flags:
 
 
 def judge_quaternions(
-    place: Place, values: Floats, *, column: str = "qw"
+    place: Place, values: Floats
 ) -> tuple[Floats, dict[str, Flags], tuple[str, ...]]:
     """Unit quaternions (N, 4) of what a tracker wrote, reasons to mask rows, and what was scaled.
 
@@ -34,14 +34,10 @@ def judge_quaternions(
     there = ~lost & ~zero
     if wrong.sum() > MOST_BAD_NORMS * max(int(there.sum()), 1) and wrong.sum() > 1:
         first = int(np.flatnonzero(wrong)[0])
-        raise place.error(
-            first,
-            column,
-            f"a norm of {norm[first]:.4g}, and {wrong.sum()} of {there.sum()} quaternions off by more"
-            f" than {NORM_WRONG:g}",
-            "quaternions of norm 1",
-            "checking which columns hold the quaternion",
-        )
+        share = f"{wrong.sum()} of {there.sum()} quaternions off by more than {NORM_WRONG:g}"
+        got = f"a norm of {norm[first]:.4g}, and {share}"
+        hint = "checking which columns hold the quaternion"
+        raise place.error(first, "qw", got, "quaternions of norm 1", hint)
     good = there & ~wrong
     rounded = good & (off > NORM_ROUNDED)
     unit = np.zeros_like(values)

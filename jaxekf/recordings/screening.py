@@ -209,12 +209,7 @@ def judge_markers(
 
 
 def judge_points(
-    place: Place,
-    time_ns: Times,
-    pixel: Floats,
-    account: Intake,
-    *,
-    seen: Flags | None = None,
+    place: Place, time_ns: Times, pixel: Floats, account: Intake, *, seen: Flags | None = None
 ) -> tuple[Flags, Intake]:
     """Which rows (N,), each of a landmark's image point (N, 2), are of one that was found; the others are
     masked, by reason.
@@ -251,13 +246,10 @@ def in_order(
     early = np.flatnonzero(np.diff(time_ns) < 0)
     if early.size and not sort:
         at = int(early[0]) + 1
-        raise place.error(
-            at,
-            "time",
-            f"{_seconds(time_ns[at])} s after {_seconds(time_ns[at - 1])} s",
-            "times that increase" if part is None else "times that do not decrease",
-            "splitting logs that were put together, or --sort to order the rows by time",
-        )
+        got = f"{_seconds(time_ns[at])} s after {_seconds(time_ns[at - 1])} s"
+        expected = "times that increase" if part is None else "times that do not decrease"
+        hint = "splitting logs that were put together, or --sort to order the rows by time"
+        raise place.error(at, "time", got, expected, hint)
     if early.size:
         late = int(np.sum(time_ns < np.maximum.accumulate(time_ns)))
         order = np.argsort(time_ns, kind="stable")
@@ -271,13 +263,10 @@ def in_order(
         if not same.all():
             at = int(order[again[np.argmin(same)]])
             named = "" if part is None else f"'{parts[part[at]]}' at "
-            raise place.error(
-                at,
-                "time",
-                f"{named}{_seconds(time_ns[at])} s twice with other numbers",
-                "each time once" if part is None else "each of them once a frame",
-                "exporting times with more digits, or removing one of the rows",
-            )
+            got = f"{named}{_seconds(time_ns[at])} s twice with other numbers"
+            expected = "each time once" if part is None else "each of them once a frame"
+            hint = "exporting times with more digits, or removing one of the rows"
+            raise place.error(at, "time", got, expected, hint)
     kept = np.ones(len(time), bool)
     kept[again] = False
     dropped = {}
@@ -360,13 +349,9 @@ def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> No
         return
     step = float(np.median(np.diff(time_ns))) * 1e-9
     if 0.0 < step < FASTEST_S:
-        raise place.error(
-            None,
-            "time",
-            f"a sample every {step:.3g} s",
-            f"a rate of {1e-3 / FASTEST_S:g} kHz at most",
-            _unit_hint(place, 's", or "ms'),
-        )
+        got = f"a sample every {step:.3g} s"
+        expected = f"a rate of {1e-3 / FASTEST_S:g} kHz at most"
+        raise place.error(None, "time", got, expected, _unit_hint(place, 's", or "ms'))
     if step < slowest_s:
         return
     for unit, factor in (("ms", 1e3), ("µs", 1e6), ("ns", 1e9)):

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import leaf_names
+from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Recording
 from tuning.comparison.allan_only import allan_only
-from tuning.parametrisation.free_vector import Layout, Leaf
+from tuning.parametrisation.free_vector import Layout
+from tuning.parametrisation.leaf import Leaf
 from tuning.persistence.fold_checkpoint import FoldCheckpoint, pack_found, unpack_found
 from tuning.results.fitted import FittedParameters
 from tuning.results.searched import Found, Searched
@@ -41,7 +42,7 @@ def by_allan(
 ) -> FittedParameters:
     """The start with the sensor noise of the runs' static intervals, or of a static log."""
     params = allan_only(model, start, runs, log).params
-    values = dict(zip(leaf_names(params), jax.tree.leaves(params), strict=True))
+    values = leaves_by_name(params)
     # Leaves of the encoder are left out: no held-out run has any for itself.
     leaves = [_as(leaf, values[leaf.name]) for leaf in layout.leaves if leaf.name in values]
     return FittedParameters(model, params, Layout(tuple(leaves)))

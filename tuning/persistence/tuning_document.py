@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import leaf_names
+from jaxekf.estimation.parameters import leaf_names, leaves_by_name
 from jaxekf.io.documents import codec
 from jaxekf.io.documents.tuning import TuningDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
 from tuning.objective.fisher_information import interval
-from tuning.parametrisation.free_vector import SCALED, Leaf
+from tuning.parametrisation.free_vector import SCALED
+from tuning.parametrisation.leaf import Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
 from tuning.persistence._tuning_warnings import cautions
 from tuning.results.comparison import Row, as_dicts
@@ -73,15 +73,7 @@ def record(
         "rejected_steps": int(tuned.rejections),
         "covariance_scale": float(tuned.scale),
         "also_scaled": _also_scaled(tuned),
-        "history": [
-            {
-                "number": int(step.number),
-                "training": float(step.training),
-                "validation": float(step.validation),
-                "rejected": bool(step.rejected),
-            }
-            for step in tuned.history
-        ],
+        "history": [step._asdict() for step in tuned.history],
         "best_iteration": int(tuned.best.number),
         "starts": [outcome._asdict() for outcome in tuned.starts],
         "numbers": _numbers(tuned),
@@ -129,6 +121,19 @@ def save_record(
         If `judged_on` contradicts the names of the runs.
     RecordingError
         If a folder has the name of the file.
+
+    Examples
+    --------
+    >>> import json, tempfile
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=2)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = tuning.save_record(folder, tuned)
+    ...     document = json.loads(file.read_text("utf-8"))
+    >>> file.name, document["runs"], document["numbers"][0]["label"]
+    ('tuning.json', ['free-1'], 'noise.optical')
     """
     return write_record(folder, record(tuned, rows=rows, judged_on=judged_on, folds=folds))
 
@@ -159,8 +164,7 @@ def _judged_on(tuned: Tuned, rows: Sequence[Row], given: JudgedOn | None) -> Jud
 
 def _units(tuned: Tuned) -> dict[str, str]:
     """The unit of each free parameter, by its name."""
-    every = tuned.model.units._replace(truth=TRUTH_UNITS)
-    units = dict(zip(leaf_names(every), jax.tree.leaves(every), strict=True))
+    units = leaves_by_name(tuned.model.units._replace(truth=TRUTH_UNITS))
     return {leaf.name: units[leaf.name] for leaf in tuned.layout.leaves}
 
 
@@ -188,39 +192,34 @@ def _truth(tuned: Tuned) -> dict[str, Any] | None:
 def _numbers(tuned: Tuned) -> list[dict[str, Any]]:
     """Each free number: start, tuned value, and confidence interval."""
     where, units = tuned.layout, _units(tuned)
-    labels, moved = where.labels(), tuned.moved
-    start, end = np.asarray(where.to_free(tuned.start)), np.asarray(tuned.free)
-    first = interval(where, start, np.zeros(len(start)))
-    last = interval(where, end, np.zeros(len(end)))
+    start = np.asarray(where.to_free(tuned.start))
+    none = np.zeros(len(start))
+    columns = where.labels(), interval(where, start, none), interval(where, tuned.free, none)
     known, unknown, runs = tuned.intervals, tuned.open, tuned.origin.get("runs", [])
-    found, at = [], 0
-    for leaf in where.leaves:
-        for i in range(leaf.size):
-            label, logarithm = labels[at], leaf.is_logarithm(i)
-            run = i // leaf.each
-            change = leaf.unbounded(end[at], i) - leaf.unbounded(start[at], i)
-            scales = logarithm and leaf.name.startswith(SCALED)
-            ends = known.get(label)
-            found.append(
-                {
-                    "label": label,
-                    "name": label.split(" of run ")[0],
-                    "run": (runs[run] if run < len(runs) else str(run)) if leaf.runs else None,
-                    "truth": leaf.name.startswith("truth."),
-                    "unit": units[leaf.name] if logarithm or leaf.kind == "linear" else "1",
-                    "logarithm": logarithm,
-                    "start": first[at][0],
-                    "tuned": last[at][0],
-                    "interval": None if ends is None else list(ends[1:]),
-                    "written": last[at][0] * (np.sqrt(tuned.scale) if scales else 1.0),
-                    "moved": moved[at],
-                    "change": float(np.exp(change)) if logarithm else change / leaf.prior,
-                    "left_open": label in unknown,
-                    "would_tell": unknown.get(label),
-                    "bounds": _bounds(leaf),
-                }
-            )
-            at += 1
+    each = zip(where.numbers(), *columns, tuned.moved, tuned.changes, strict=True)
+    found = []
+    for (leaf, i), label, (first, *_), (last, *_), moved, change in each:
+        logarithm, run, ends = leaf.is_logarithm(i), i // leaf.each, known.get(label)
+        scales = logarithm and leaf.name.startswith(SCALED)
+        found.append(
+            {
+                "label": label,
+                "name": label.split(" of run ")[0],
+                "run": (runs[run] if run < len(runs) else str(run)) if leaf.runs else None,
+                "truth": leaf.name.startswith("truth."),
+                "unit": units[leaf.name] if logarithm or leaf.kind == "linear" else "1",
+                "logarithm": logarithm,
+                "start": first,
+                "tuned": last,
+                "interval": None if ends is None else list(ends[1:]),
+                "written": last * (np.sqrt(tuned.scale) if scales else 1.0),
+                "moved": moved,
+                "change": change,
+                "left_open": label in unknown,
+                "would_tell": unknown.get(label),
+                "bounds": _bounds(leaf),
+            }
+        )
     return found
 
 

@@ -1,17 +1,16 @@
 """Result of a cross-validation: folds, their spread, and the work that they took."""
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxekf._support.deprecations import warn_renamed
-from jaxekf.estimation.parameters import leaf_names
-from jaxekf.filtering.model import Parameters
+from jaxekf.estimation.parameters import leaves_by_name
+from jaxekf.evaluation.spread import Spread, spread_of
 from jaxekf.recordings.types import Floats
 from tuning.results.comparison import Row, as_dicts, by_variant
 from tuning.results.fitted import Fitted
@@ -19,11 +18,17 @@ from tuning.results.searched import Searched
 from tuning.results.tuned import Tuned
 
 COLUMNS = tuple(name for name in Row._fields if name not in ("run", "variant"))
-_BEST_AT_ONE = ("nis", "nees", "position_nees")
 
 
 class Work(NamedTuple):
-    """Number of filterings of all training runs."""
+    """Number of filterings of all training runs.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> tuning.Work(filterings=5.0, gradients=10.0).forward(gradient_cost=3.0)
+    35.0
+    """
 
     filterings: float
     """Filterings without a gradient: values, Fisher information (two for each number and one), the scale,
@@ -44,7 +49,18 @@ def work_of(fitted: Fitted) -> Work:
 
 
 class Fold(NamedTuple):
-    """One tuning, and the runs that it did not learn from."""
+    """One tuning, and the runs that it did not learn from.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> first = tuning.cross_validate(runs, **problem).folds[0]
+    >>> first.held_out, first.tuned.origin["runs"], first.work["tuned"].gradients
+    (('free-1',), ['free-2'], 2.0)
+    """
 
     held_out: tuple[str, ...]
     """Names of runs."""
@@ -65,18 +81,19 @@ class Fold(NamedTuple):
         return {"start": Work(0.0, 0.0)} | {name: work_of(one) for name, one in every.items()}
 
 
-class Spread(NamedTuple):
-    """Statistics of a column over the runs that have a number there; NaN if there are too few."""
-
-    mean: float
-    deviation: float
-    """Standard deviation of a run, by n - 1."""
-    worst: float
-    """Largest error; for NIS and NEES the number farthest from 1 as a factor."""
-
-
 class ParameterSpread(NamedTuple):
-    """Values of one parameter over the folds, in its unit."""
+    """Values of one parameter over the folds, in its unit.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> optical = tuning.cross_validate(runs, **problem).parameters["noise.optical"]
+    >>> optical.each.shape, f"{optical.mean:.4f} rad", bool(optical.deviation < 0.1 * optical.mean)
+    ((2,), '0.0054 rad', True)
+    """
 
     start: Floats
     """In the parameter's shape."""
@@ -90,7 +107,18 @@ class ParameterSpread(NamedTuple):
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Result of `tuning.cross_validate`."""
+    """Result of `tuning.cross_validate`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> found = tuning.cross_validate(runs, **problem)
+    >>> {name: round(spread.mean, 2) for name, spread in found.spread("attitude_rmse_deg").items()}
+    {'hold last': 8.38, 'start': 0.1, 'tuned': 0.1}
+    """
 
     rows: list[Row]
     """Rows of each held-out run in the order given: `hold last`, `start`, and its fold's baselines and
@@ -118,21 +146,20 @@ class CrossValidation:
 
     def spread(self, column: str = "attitude_rmse_deg") -> dict[str, Spread]:
         """Statistics of one of `COLUMNS` over the runs, by variant."""
-        return {
-            name: _spread(values, column) for name, values in by_variant(self.rows, column).items()
-        }
+        columns = by_variant(self.rows, column)
+        return {name: spread_of(values, column) for name, values in columns.items()}
 
     @property
     def parameters(self) -> dict[str, ParameterSpread]:
         """Free parameters over the folds by name; the fold's mean where each run has its own."""
-        first, found = self.folds[0].tuned, {}
-        values = [_by_name(fold.tuned.params) for fold in self.folds]
-        start = _by_name(first.start._replace(truth=()))
-        for name in (leaf.name for leaf in first.layout.leaves):
+        tuned, found = self.folds[0].tuned, {}
+        values = [leaves_by_name(fold.tuned.params) for fold in self.folds]
+        start = leaves_by_name(tuned.start._replace(truth=()))
+        for name in (leaf.name for leaf in tuned.layout.leaves):
             if name in start:
-                each = np.stack([value[name] for value in values])
-                deviation = each.std(axis=0, ddof=1)
-                found[name] = ParameterSpread(start[name], each.mean(axis=0), deviation, each)
+                each = np.stack([np.asarray(value[name], float) for value in values])
+                deviation, first = each.std(axis=0, ddof=1), np.asarray(start[name], float)
+                found[name] = ParameterSpread(first, each.mean(axis=0), deviation, each)
         return found
 
     def as_dict(self) -> dict[str, Any]:
@@ -160,19 +187,3 @@ class CrossValidation:
                 },
             },
         }
-
-
-def _spread(values: Sequence[float], column: str) -> Spread:
-    nan = float("nan")
-    if not values:
-        return Spread(nan, nan, nan)
-    array = np.array(values)
-    with np.errstate(divide="ignore"):
-        badness = np.abs(np.log(array)) if column in _BEST_AT_ONE else array
-    deviation = float(array.std(ddof=1)) if len(values) > 1 else nan
-    return Spread(float(array.mean()), deviation, float(array[np.argmax(badness)]))
-
-
-def _by_name(params: Parameters) -> dict[str, Floats]:
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
-    return dict(zip(leaf_names(params), leaves, strict=True))

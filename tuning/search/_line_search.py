@@ -88,8 +88,7 @@ class LineSearch:
     def state_dict(self) -> dict[str, Any]:
         """State as arrays by name."""
         found: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _STATE}
-        leaves = jax.tree.leaves(self.state)
-        return found | {f"state_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+        return found | arrays_of(self.state, "state_")
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from the state that `state_dict` returned."""
@@ -97,14 +96,23 @@ class LineSearch:
             value = state[name]
             plain = {"value": float, "rejections": int, "small_gains": int}
             setattr(self, name, plain[name](value) if name in plain else np.asarray(value))
-        leaves, structure = jax.tree.flatten(self.state)
-        again = [
-            np.asarray(state[f"state_{i}"], np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)
-        ]
-        self.state = jax.tree.unflatten(structure, again)
+        self.state = tree_of(state, "state_", self.state)
 
     def _falls(self, value: float) -> bool:
         """Armijo's condition of sufficient decrease."""
         if not np.isfinite(self.value):
             return True
         return value <= self.value + 1e-4 * float(self.change @ self.gradient)
+
+
+def arrays_of(tree: Any, prefix: str) -> dict[str, Any]:
+    """Leaves of a pytree as arrays by name: the prefix and a number."""
+    return {f"{prefix}{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+
+
+def tree_of(arrays: Mapping[str, Any], prefix: str, like: Any) -> Any:
+    """The pytree that `arrays_of` was given, in the structure and types of another."""
+    leaves, structure = jax.tree.flatten(like)
+    types = [np.asarray(leaf).dtype for leaf in leaves]
+    again = [np.asarray(arrays[f"{prefix}{i}"], kind) for i, kind in enumerate(types)]
+    return jax.tree.unflatten(structure, again)

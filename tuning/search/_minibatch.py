@@ -17,6 +17,7 @@ from tuning.objective.data import Data
 from tuning.objective.objectives import Objective
 from tuning.parametrisation.free_vector import Layout
 from tuning.results.tuned import Iteration, Progress
+from tuning.search._line_search import arrays_of, tree_of
 from tuning.search.descent import Descent
 from tuning.search.evaluation import evaluate_at, on_host
 
@@ -160,9 +161,7 @@ class MinibatchDescent(Descent):
     def state_dict(self) -> dict[str, Any]:
         """State of the search as arrays by name."""
         found = {f"batches_{name}": np.asarray(getattr(self, name)) for name in _STATE}
-        leaves = jax.tree.leaves(self.memory)
-        found |= {f"adam_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        return found | super().state_dict()
+        return found | arrays_of(self.memory, "adam_") | super().state_dict()
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from the state that `state_dict` returned."""
@@ -170,9 +169,7 @@ class MinibatchDescent(Descent):
         self._begin(state["batches_free"], float(state["batches_rate"]))
         for name in ("skipped", "halved", "done"):
             setattr(self, name, int(state[f"batches_{name}"]))
-        leaves, structure = jax.tree.flatten(self.memory)
-        again = [np.asarray(state[f"adam_{i}"], leaf.dtype) for i, leaf in enumerate(leaves)]
-        self.memory = jax.tree.unflatten(structure, again)
+        self.memory = tree_of(state, "adam_", self.memory)
 
 
 def cut(data: Data, size: int, rng: np.random.Generator) -> list[Batch]:

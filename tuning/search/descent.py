@@ -16,6 +16,7 @@ from tuning.search._line_search import LineSearch
 from tuning.search.evaluation import Evaluation, on_host
 
 _IMPROVEMENT = 1e-4
+_STATE = ("last_improvement", "iterations", "evaluations", "filterings", "fixed", "stopped")
 _LEAST_EVIDENCE = 3e-3
 """Gain of log-likelihood, of all rows together, that is not worth another step."""
 
@@ -205,12 +206,7 @@ class Descent(Evaluation):
             "history": np.array(self.history, float),
             "best_free": np.asarray(self.best.free),
             "best_number": np.array(self.best.step.number),
-            "last_improvement": np.array(self.last_improvement),
-            "iterations": np.array(self.iterations),
-            "evaluations": np.array(self.evaluations),
-            "filterings": np.array(self.filterings),
-            "fixed": self.fixed,
-            "stopped": np.array(self.stopped),
+            **{name: np.array(getattr(self, name)) for name in _STATE},
         }
         if self.own_free is not None:
             found["own_free"] = np.asarray(self.own_free)

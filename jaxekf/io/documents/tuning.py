@@ -6,6 +6,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from jaxekf.io.documents.codec import Document
+from jaxekf.io.documents.result import Quantity
 from jaxekf.recordings.types import Floats
 
 
@@ -87,13 +88,6 @@ class FoldsDocument(Struct, kw_only=True):
     work: dict[str, Any] = field(default_factory=dict)
 
 
-class Entry(Struct):
-    """A value with its unit."""
-
-    value: Floats
-    unit: str
-
-
 class TuningDocument(Document, kw_only=True):
     """`tuning.json`; keys with a default are missing in tunings of earlier versions."""
 
@@ -117,7 +111,7 @@ class TuningDocument(Document, kw_only=True):
     starts: list[Start]
     numbers: list[FreeNumber]
     units: dict[str, str]
-    truth: dict[str, Entry] | None
+    truth: dict[str, Quantity] | None
     judged_on: str | None
     rows: list[RunScore]
     folds: FoldsDocument | None

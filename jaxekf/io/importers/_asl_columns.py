@@ -132,24 +132,16 @@ def _columns(
 ) -> _Columns | None:
     """The columns that headers name; None if no header does."""
     if width <= len(wanted):
-        raise RecordingError(
-            path,
-            f"{width} cells",
-            f"at least {len(wanted) + 1}: a time and {', '.join(wanted)}",
-            "a file that holds them all",
-            line=line,
-        )
+        got = f"{width} cells"
+        expected = f"at least {len(wanted) + 1}: a time and {', '.join(wanted)}"
+        raise RecordingError(path, got, expected, "a file that holds them all", line=line)
     found = [(header, _named(path, header, width, wanted)) for header in headers]
     named = [(header, columns) for header, columns in found if columns is not None]
     for header, columns in named[1:]:
         if columns.indices != named[0][1].indices:
-            raise RecordingError(
-                path,
-                "a second header with other columns",
-                "one order for all rows",
-                "splitting the file there",
-                line=header.line,
-            )
+            got = "a second header with other columns"
+            expected = "one order for all rows"
+            raise RecordingError(path, got, expected, "splitting the file there", line=header.line)
     return named[0][1] if named else None
 
 
@@ -161,21 +153,13 @@ def _named(path: Path, header: _Header, width: int, wanted: Sequence[str]) -> _C
         return None
     missing = [component for component in wanted if component not in found]
     if missing:
-        raise RecordingError(
-            path,
-            f"a header without {', '.join(missing)}",
-            f"columns for {', '.join(wanted)}",
-            "naming every column, or removing the header to take them in this order",
-            line=header.line,
-        )
+        got = f"a header without {', '.join(missing)}"
+        hint = "naming every column, or removing the header to take them in this order"
+        raise RecordingError(path, got, f"columns for {', '.join(wanted)}", hint, line=header.line)
     if len(names) != width:
-        raise RecordingError(
-            path,
-            f"a header of {len(names)} columns over rows of {width} cells",
-            "as many names as cells",
-            "correcting the header",
-            line=header.line,
-        )
+        got = f"a header of {len(names)} columns over rows of {width} cells"
+        expected = "as many names as cells"
+        raise RecordingError(path, got, expected, "correcting the header", line=header.line)
     _check_units(path, header.line, units, found)
     indices = [found[component] for component in wanted]
     return _Columns(indices, [names[i] for i in indices])
@@ -201,13 +185,9 @@ def _components(
         pattern = re.compile(rf"{_BEGINNINGS[kind]}(?:[_.].*)?[_.]?{axis}", re.IGNORECASE)
         at = [i for i, name in enumerate(names) if i > 0 and pattern.fullmatch(name)]
         if len(at) > 1:
-            raise RecordingError(
-                path,
-                f"columns {' and '.join(names[i] for i in at)}",
-                f"one for {component}",
-                "renaming all but one",
-                line=line,
-            )
+            got = f"columns {' and '.join(names[i] for i in at)}"
+            expected = f"one for {component}"
+            raise RecordingError(path, got, expected, "renaming all but one", line=line)
         if at:
             found[component] = at[0]
     return found
@@ -218,14 +198,9 @@ def _check_units(path: Path, line: int, units: Sequence[str], found: Mapping[str
     for component, index in {"time": 0, **found}.items():
         kind = component[0]
         if kind in _FOREIGN and re.fullmatch(rf"(?:{_FOREIGN[kind]}).*", units[index].lower()):
-            raise RecordingError(
-                path,
-                f"the unit {units[index]}",
-                _EXPECTED[kind],
-                "converting the column exactly",
-                line=line,
-                column=component,
-            )
+            got = f"the unit {units[index]}"
+            hint = "converting the column exactly"
+            raise RecordingError(path, got, _EXPECTED[kind], hint, line=line, column=component)
 
 
 # ---------------------------------------------------------------------------------------------

@@ -51,12 +51,9 @@ def read_description(file: Path) -> Mapping[str, Any]:
     except (yaml.YAMLError, ValueError, OSError) as error:  # ValueError: text, dates
         mark = getattr(error, "problem_mark", None)
         reason = getattr(error, "problem", None) or error
+        got = f"text that is not YAML ({reason})"
         raise RecordingError(
-            file,
-            f"text that is not YAML ({reason})",
-            "YAML",
-            "correcting it",
-            line=None if mark is None else mark.line + 1,
+            file, got, "YAML", "correcting it", line=None if mark is None else mark.line + 1
         ) from error
     if not isinstance(description, dict):
         raise RecordingError(file, f"{description!r}", "keys and values", "correcting it")
@@ -101,11 +98,6 @@ def imu_noise(file: Path, description: Mapping[str, Any]) -> dict[str, float]:
         except (TypeError, ValueError):
             noise[key] = np.nan
         if not 0.0 <= noise[key] < np.inf:
-            raise RecordingError(
-                file,
-                f"{description[key]!r}",
-                "a density of 0 or more",
-                "correcting it",
-                column=key,
-            )
+            got = f"{description[key]!r}"
+            raise RecordingError(file, got, "a density of 0 or more", "correcting it", column=key)
     return noise

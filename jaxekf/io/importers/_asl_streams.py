@@ -165,12 +165,8 @@ def only_recording(folder: Path) -> Path:
     if len(found) > 1 and folder not in found:
         names = [one.relative_to(folder).as_posix() for one in found]
         more = ", ..." if len(names) > _LISTED else ""
-        raise RecordingError(
-            folder,
-            f"{len(names)} recordings ({', '.join(names[:_LISTED])}{more})",
-            "one",
-            f"naming it: {folder / names[0]}",
-        )
+        got = f"{len(names)} recordings ({', '.join(names[:_LISTED])}{more})"
+        raise RecordingError(folder, got, "one", f"naming it: {folder / names[0]}")
     return found[0] if len(found) == 1 else folder
 
 
@@ -200,12 +196,9 @@ def _streams(path: Path) -> Sequence[Stream]:
     if pair is not None:
         return pair
     got = "no stream" if path.is_dir() else "no such folder, and no pair of files"
-    raise RecordingError(
-        path,
-        "a file" if path.is_file() else got,
-        "a folder that holds mav0, or the prefix of NAME_imu.txt and NAME_mocap.csv",
-        "a recording that asl.find(FOLDER) lists",
-    )
+    expected = "a folder that holds mav0, or the prefix of NAME_imu.txt and NAME_mocap.csv"
+    hint = "a recording that asl.find(FOLDER) lists"
+    raise RecordingError(path, "a file" if path.is_file() else got, expected, hint)
 
 
 def _given(value: Path | str, base: Path | None) -> Stream:
@@ -227,9 +220,5 @@ def _preferred(
         if stream.kind in kinds:
             return stream
     listed = ", ".join(f"{stream.label} ({stream.kind})" for stream in streams)
-    raise RecordingError(
-        path or option,
-        f"only {listed}" if listed else "no stream",
-        _WANTED[option],
-        f"{option}=PATH",
-    )
+    got = f"only {listed}" if listed else "no stream"
+    raise RecordingError(path or option, got, _WANTED[option], f"{option}=PATH")

@@ -71,20 +71,14 @@ def check_database(file: Path) -> None:
         return
     log = file.with_name(file.name + "-wal")
     if log.is_file() and log.stat().st_size:
-        raise RecordingError(
-            file,
-            f"a database whose last messages are still in {log.name}",
-            "one that was closed",
-            f"`sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'`, and `ros2 bag reindex`",
-        )
+        got = f"a database whose last messages are still in {log.name}"
+        hint = f"`sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'`, and `ros2 bag reindex`"
+        raise RecordingError(file, got, "one that was closed", hint)
     truncation = _truncation(file)
     if truncation:
-        raise RecordingError(
-            file,
-            f"a database that {truncation}",
-            "an SQLite file of a ROS 2 bag that is whole",
-            "copying it again, or `sqlite3 FILE .recover`",
-        )
+        got = f"a database that {truncation}"
+        expected = "an SQLite file of a ROS 2 bag that is whole"
+        raise RecordingError(file, got, expected, "copying it again, or `sqlite3 FILE .recover`")
 
 
 class _Stored(NamedTuple):

@@ -68,12 +68,9 @@ class Bag:
         except Exception as error:
             raise unreadable(self.path, error, f"{topic.name}[{count}]") from error
         if count < topic.stated:
-            raise RecordingError(
-                self.place(topic),
-                f"{count} messages{sizes(self.path)}",
-                f"the {topic.stated} that the bag states",
-                _remedy(self.path),
-            )
+            got = f"{count} messages{sizes(self.path)}"
+            expected = f"the {topic.stated} that the bag states"
+            raise RecordingError(self.place(topic), got, expected, _remedy(self.path))
 
     def _check_definition(self, topic: Topic, connections: list[Any]) -> None:
         """Raise if the file's type of this name is not the standard one."""
@@ -84,12 +81,9 @@ class Bag:
             known = self._types.hash_rihs01(topic.type)
             stated = {c.digest for c in connections if str(c.digest).startswith("RIHS01_")}
         if stated - {known}:
-            raise RecordingError(
-                self.place(topic),
-                f"a {topic.type} that is not the standard one ({', '.join(sorted(stated))})",
-                known,
-                "converting its messages to the standard type",
-            )
+            got = f"a {topic.type} that is not the standard one ({', '.join(sorted(stated))})"
+            hint = "converting its messages to the standard type"
+            raise RecordingError(self.place(topic), got, known, hint)
 
 
 @contextmanager
@@ -151,12 +145,9 @@ def _check_place(path: Path) -> None:
         raise RecordingError(path, "no such file or folder", _WANTED, "another path")
     if path.is_dir() and not (path / "metadata.yaml").is_file():
         parts = [file.name for file in sorted(path.iterdir()) if file.suffix in KINDS]
-        raise RecordingError(
-            path,
-            f"a folder without metadata.yaml{' but with ' + ', '.join(parts) if parts else ''}",
-            _WANTED,
-            "giving one of these files, or `ros2 bag reindex`" if parts else "another path",
-        )
+        got = f"a folder without metadata.yaml{' but with ' + ', '.join(parts) if parts else ''}"
+        hint = "giving one of these files, or `ros2 bag reindex`" if parts else "another path"
+        raise RecordingError(path, got, _WANTED, hint)
     if path.is_file() and path.suffix not in KINDS:
         raise RecordingError(path, f"a file '{path.name}'", _WANTED, "another path")
     for file in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
@@ -170,25 +161,17 @@ def _reader(path: Path) -> tuple[Any, Any]:
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise RecordingError(
-            path,
-            f"a bag without the library that reads it ({error})",
-            "rosbags to be installed",
-            "pip install 'jaxekf[ros]'",
-        ) from error
-    if not _is_ros1(path):
-        try:
-            return rosbag2.Reader(path), get_typestore(Stores.LATEST)
-        except Exception as error:
-            raise unreadable(path, error) from error
-    # ROS 1 defines transforms in a package of its own, which the library's standard types leave out.
-    typestore = get_typestore(Stores.ROS1_NOETIC)
-    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
-        typestore.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name)
-        )
+        got = f"a bag without the library that reads it ({error})"
+        expected = "rosbags to be installed"
+        raise RecordingError(path, got, expected, "pip install 'jaxekf[ros]'") from error
+    typestore = get_typestore(Stores.ROS1_NOETIC if _is_ros1(path) else Stores.LATEST)
+    if _is_ros1(path):
+        # ROS 1 defines transforms in a package of its own, which the library's standard types leave out.
+        content = "geometry_msgs/TransformStamped[] transforms\n"
+        for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
+            typestore.register(get_types_from_msg(content, name))
     try:
-        return rosbag1.Reader(path), typestore
+        return (rosbag1 if _is_ros1(path) else rosbag2).Reader(path), typestore
     except Exception as error:
         raise unreadable(path, error) from error
 
@@ -198,12 +181,8 @@ def _check_total(path: Path, reader: Any) -> None:
     listed = sum(connection.msgcount for connection in reader.connections)
     if listed < reader.message_count:
         place = path / "metadata.yaml" if path.is_dir() else path
-        raise RecordingError(
-            place,
-            f"topics of {listed} messages in all",
-            f"the {reader.message_count} that it states",
-            _remedy(path),
-        )
+        expected = f"the {reader.message_count} that it states"
+        raise RecordingError(place, f"topics of {listed} messages in all", expected, _remedy(path))
 
 
 def _type(name: str) -> str:

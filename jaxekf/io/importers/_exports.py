@@ -4,7 +4,7 @@ Errors name file, line and column. A last line that is truncated is left out and
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.io._csv_content import Content, read_content
+from jaxekf.io._csv_content import Content, empty_file, read_content
 from jaxekf.io._csv_text import DELIMITERS, read_rows, split_line
 from jaxekf.io.csv_table import Table, numbers
 from jaxekf.io.units import UNITS
@@ -71,12 +71,9 @@ class Export(NamedTuple):
         for line in self.head:
             if {name.lower() for name in names} <= {bare(cell) for cell in line.cells}:
                 return line
-        raise RecordingError(
-            self.path,
-            f"no line with {', '.join(names)} among the first {len(self.head)}",
-            expected,
-            "another file, or exporting again with quaternions and positions",
-        )
+        got = f"no line with {', '.join(names)} among the first {len(self.head)}"
+        hint = "another file, or exporting again with quaternions and positions"
+        raise RecordingError(self.path, got, expected, hint)
 
     def table(self, header: HeaderLine, width: int, end: int | None = None) -> Table:
         """The rows below a header, up to an offset; the columns are called by their number."""
@@ -107,9 +104,7 @@ def read_export(path: Path | str, expected: str) -> Export:
     export = Export(content, delimiter, [])
     head = export.lines(0, _HEADER_LINES)
     if not head:
-        raise RecordingError(
-            content.path, "an empty file", expected, "exporting the recording again"
-        )
+        raise empty_file(content.path, expected)
     return export._replace(head=head)
 
 
@@ -169,9 +164,8 @@ class StampedRows(NamedTuple):
 
     def floats(self, columns: Sequence[int], labels: Sequence[str]) -> Floats:
         """Columns (N, len(columns)), NaN for blank cells; messages call them by their `labels`."""
-        return numbers(
-            self.table.named(dict(zip(columns, labels, strict=True))), labels, blank=True
-        )
+        table = self.table.named(dict(zip(columns, labels, strict=True)))
+        return numbers(table, labels, blank=True)
 
 
 def stamped_rows(table: Table, time_ns: Times, known: Flags) -> StampedRows:
@@ -193,13 +187,13 @@ def stamped_rows(table: Table, time_ns: Times, known: Flags) -> StampedRows:
     return StampedRows(table.take(known), time_ns[known], dropped)
 
 
-def accounted(account: Intake, source: StampedRows) -> Intake:
+def accounted(account: Intake, table: Table, dropped: Mapping[str, Reason]) -> Intake:
     """The account of a stream, with the rows that were left out before it was made."""
     return replace(
         account,
-        rows=account.rows + sum(reason.count for reason in source.dropped.values()),
-        dropped={**account.dropped, **source.dropped},
-        notes=(*source.table.text.notes, *account.notes),
+        rows=account.rows + sum(reason.count for reason in dropped.values()),
+        dropped={**account.dropped, **dropped},
+        notes=(*table.text.notes, *account.notes),
     )
 
 
@@ -229,7 +223,7 @@ def pose_stream(
     optical, account = screening.optical(
         source.table.place, source.time_ns, quaternion, position, also=also, **options
     )
-    return optical, accounted(account, source)
+    return optical, accounted(account, source.table, source.dropped)
 
 
 def tracker_alone(

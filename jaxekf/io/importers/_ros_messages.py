@@ -58,13 +58,9 @@ class TopicSamples:
         frame = header.frame_id
         if frame != self.frame:
             if self._times and self._one_frame:
-                raise self.place.error(
-                    len(self),
-                    "frame_id",
-                    f"'{frame}' after '{self.frame}'",
-                    "one frame",
-                    "recording each on a topic of its own",
-                )
+                got = f"'{frame}' after '{self.frame}'"
+                hint = "recording each on a topic of its own"
+                raise self.place.error(len(self), "frame_id", got, "one frame", hint)
             self.frame = frame
         stamp = header.stamp
         self._times.append(received if self._receive else stamp.sec * NANOSECONDS + stamp.nanosec)
@@ -99,13 +95,9 @@ def imu(source: Source, topic: Topic) -> tuple[Imu, Intake]:
     time_ns, values = rows.arrays(8)
     rate, force, absent = values[:, :3], values[:, 3:6], values[:, 6:] == -1.0
     if absent[:, 0].all():
-        raise rows.place.error(
-            None,
-            "angular_velocity",
-            "messages without it (their covariance begins with -1)",
-            "angular rates",
-            "the topic of another IMU",
-        )
+        got = "messages without it (their covariance begins with -1)"
+        expected = "angular rates"
+        raise rows.place.error(None, "angular_velocity", got, expected, "the topic of another IMU")
     rate[absent[:, 0]] = np.nan
     source.info["imu_frame"] = rows.frame
     name = f"{topic.name}: "
@@ -160,13 +152,10 @@ def optical(source: Source, topic: Topic, child: str | None) -> tuple[Optical, I
                 continue
             rows.add(header, received, (q.w, q.x, q.y, q.z, p.x, p.y, p.z))
     if (child is None and len(frames) > 1) or (child is not None and frames and not len(rows)):
-        raise rows.place.error(
-            None,
-            "child_frame_id",
-            f"{len(frames)} frames: {', '.join(sorted(frames))}",
-            "one" if child is None else f"'{child}' among them",
-            f"naming it (child_frame='{min(frames)}', --child-frame {min(frames)})",
-        )
+        got = f"{len(frames)} frames: {', '.join(sorted(frames))}"
+        expected = "one" if child is None else f"'{child}' among them"
+        hint = f"naming it (child_frame='{min(frames)}', --child-frame {min(frames)})"
+        raise rows.place.error(None, "child_frame_id", got, expected, hint)
     time_ns, values = rows.arrays(7)
     source.info["pose_frame"] = rows.frame
     if tracked := child or "".join(frames):
@@ -185,12 +174,9 @@ def encoder(
     """Attitude by the angle of one joint of a topic of `JOINT`."""
     bag = source.bag
     if axis is None:
-        raise RecordingError(
-            bag.place(topic),
-            "joint angles without the axis they turn about",
-            "its direction in the tracker's reference frame",
-            "axis=[x, y, z] (--axis X Y Z)",
-        )
+        got = "joint angles without the axis they turn about"
+        expected = "its direction in the tracker's reference frame"
+        raise RecordingError(bag.place(topic), got, expected, "axis=[x, y, z] (--axis X Y Z)")
     rows = TopicSamples(source, topic, name or "", one_frame=False)  # a joint is in none
     joints: dict[str, None] = {}
     for received, message in bag.messages(topic):
@@ -202,13 +188,10 @@ def encoder(
         angle = message.position[at] if at < len(message.position) else np.nan
         rows.add(message.header, received, (angle,))
     if name not in joints if name is not None else len(joints) > 1:
-        raise rows.place.error(
-            None,
-            "name",
-            f"{len(joints)} joints: {', '.join(joints) or 'none'}",
-            "one" if name is None else f"'{name}' among them",
-            "naming one of them (joint_name=, --joint-name)",
-        )
+        got = f"{len(joints)} joints: {', '.join(joints) or 'none'}"
+        expected = "one" if name is None else f"'{name}' among them"
+        hint = "naming one of them (joint_name=, --joint-name)"
+        raise rows.place.error(None, "name", got, expected, hint)
     time_ns, values = rows.arrays(1)
     turned = name or next(iter(joints))
     source.info.update(joint=turned, joint_axis=axis.tolist())

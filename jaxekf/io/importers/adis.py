@@ -44,12 +44,8 @@ def load(path: Path | str, sampling_hz: float = 100.0) -> Recording:
             file, f"no log ({error})", "an .npz file with an array 'data'", "another path"
         ) from error
     if data.ndim != 2 or data.shape[1] != 6 or not np.all(np.isfinite(data)):
-        raise RecordingError(
-            file,
-            f"an array of shape {data.shape}",
-            "six finite columns: gyroscope in deg/s, accelerometer in g",
-            "another file",
-        )
+        expected = "six finite columns: gyroscope in deg/s, accelerometer in g"
+        raise RecordingError(file, f"an array of shape {data.shape}", expected, "another file")
     time_ns = np.round(np.arange(len(data)) * (NANOSECONDS / sampling_hz)).astype(np.int64)
     imu, account = screening.imu(
         Place(file), time_ns, np.deg2rad(data[:, :3]), STANDARD_GRAVITY * data[:, 3:]

@@ -30,6 +30,7 @@ from jaxekf.io.importers._asl_streams import (
     only_recording,
     recording_name,
 )
+from jaxekf.io.importers._exports import accounted
 from jaxekf.pose_solvers.marker_pose import gravity
 from jaxekf.recordings import screening
 from jaxekf.recordings.accounts import Intake
@@ -146,7 +147,7 @@ def _imu(source: _Source) -> tuple[Imu, Intake]:
     table, time_ns, labels = source.samples[:3]
     values = finite_numbers(table, labels)
     imu, account = screening.imu(table.place, time_ns, values[:, :3].copy(), values[:, 3:].copy())
-    return imu, _accounted(account, source.samples)
+    return imu, accounted(account, table, source.samples.dropped)
 
 
 def _optical(source: _Source, body_sensor: Transform) -> tuple[Optical, Intake]:
@@ -162,17 +163,8 @@ def _optical(source: _Source, body_sensor: Transform) -> tuple[Optical, Intake]:
     )
     q_ref_body = from_scipy(to_scipy(sensor.q_ref_body) * body_sensor.rotation.inv())
     q_ref_body[~sensor.valid] = (1.0, 0.0, 0.0, 0.0)
-    return replace(sensor, q_ref_body=q_ref_body), _accounted(account, source.samples)
-
-
-def _accounted(account: Intake, samples: Samples) -> Intake:
-    """The account with the lines that were left out before it was made."""
-    return replace(
-        account,
-        rows=account.rows + sum(reason.count for reason in samples.dropped.values()),
-        dropped={**account.dropped, **samples.dropped},
-        notes=(*samples.table.text.notes, *account.notes),
-    )
+    account = accounted(account, table, source.samples.dropped)
+    return replace(sensor, q_ref_body=q_ref_body), account
 
 
 def _info(imu: _Source, pose: _Source) -> dict[str, Any]:

@@ -5,7 +5,6 @@ orientation (noise below 0.01 deg) serves as encoder-grade truth.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +36,8 @@ def find(folder: Path | str, trial: int | str) -> Path:
     folder, number = Path(folder), int(trial)
     matches = sorted(folder.rglob(f"{number:02d}_*.mat"))
     if not matches:
-        raise RecordingError(
-            folder,
-            f"no file {number:02d}_*.mat",
-            "one MATLAB file a trial",
-            "another folder or trial",
-        )
+        got, hint = f"no file {number:02d}_*.mat", "another folder or trial"
+        raise RecordingError(folder, got, "one MATLAB file a trial", hint)
     return matches[0]
 
 
@@ -68,33 +63,24 @@ def load(path: Path | str) -> Recording:
     """
     path = Path(path)
     data = _read(path)
-    rate = float(np.squeeze(data["sampling_rate"]))
+    hertz = float(np.squeeze(data["sampling_rate"]))
     count = len(data["imu_gyr"])
-    time_ns = np.round(np.arange(count) * (NANOSECONDS / rate)).astype(np.int64)
+    time_ns = np.round(np.arange(count) * (NANOSECONDS / hertz)).astype(np.int64)
     place, quaternion = Place(path), np.asarray(data["opt_quat"], float)
     movement = np.asarray(data["movement"]).reshape(-1).astype(bool)
     position, magnetometer = (
         np.asarray(data[name], float) if name in data else None for name in ("opt_pos", "imu_mag")
     )
     optical, seen = screening.optical(place, time_ns, quaternion, position)
-    imu, felt = screening.imu(
-        place,
-        time_ns,
-        np.asarray(data["imu_gyr"], float),
-        np.asarray(data["imu_acc"], float),
-        magnetometer,
-    )
+    rate, force = (np.asarray(data[name], float) for name in ("imu_gyr", "imu_acc"))
+    imu, felt = screening.imu(place, time_ns, rate, force, magnetometer)
     encoder, true = screening.encoder(place, time_ns, quaternion, scored=movement)
     return Recording(
         name=path.stem,
         optical=optical,
         imu=imu,
         encoder=encoder,
-        info={
-            "dataset": "BROAD",
-            "sampling_rate_hz": rate,
-            "assumptions": list(_ASSUMPTIONS),
-        },
+        info={"dataset": "BROAD", "sampling_rate_hz": hertz, "assumptions": list(_ASSUMPTIONS)},
         path=path,
         intake={"optical": seen, "imu": felt, "encoder": true},
     )
@@ -104,12 +90,8 @@ def _read(path: Path) -> Mapping[str, Any]:
     if path.is_dir():
         names = sorted(file.name for file in path.rglob("*.mat"))
         more = ", ..." if len(names) > _LISTED else ""
-        raise RecordingError(
-            path,
-            f"a folder that holds {len(names)} trials ({', '.join(names[:_LISTED])}{more})",
-            "one BROAD .mat file",
-            "naming it",
-        )
+        got = f"a folder that holds {len(names)} trials ({', '.join(names[:_LISTED])}{more})"
+        raise RecordingError(path, got, "one BROAD .mat file", "naming it")
     if not path.is_file():
         raise RecordingError(path, "no such file", "a BROAD .mat file", "another path")
     try:
@@ -120,9 +102,8 @@ def _read(path: Path) -> Mapping[str, Any]:
         ) from error
     missing = [name for name in _NEEDED if name not in data]
     if missing:
-        raise RecordingError(
-            path, f"a file without {missing}", f"the variables {list(_NEEDED)}", "a BROAD trial"
-        )
+        expected = f"the variables {list(_NEEDED)}"
+        raise RecordingError(path, f"a file without {missing}", expected, "a BROAD trial")
     return data
 
 
@@ -175,16 +156,9 @@ def degrade(
     q = from_scipy(clean * Rotation.from_rotvec(noise))
     visible = optical.valid[rows] & ~_gaps(rng, time_ns, gap_s, mean_interval_s)
     position = None if optical.position is None else optical.position[rows]
-    cut = imu.time_ns >= time_ns[0]
     return recording.replace(
         optical=Optical(time_ns, q, visible, position),
-        imu=replace(
-            imu,
-            time_ns=imu.time_ns[cut],
-            gyroscope=imu.gyroscope[cut],
-            accelerometer=None if imu.accelerometer is None else imu.accelerometer[cut],
-            magnetometer=None if imu.magnetometer is None else imu.magnetometer[cut],
-        ),
+        imu=imu.take(imu.time_ns >= time_ns[0]),
         info={**recording.info, "degraded_seed": seed, "optical_noise_deg": noise_deg},
     )
 

@@ -153,13 +153,11 @@ def read(name: str, path: Path | str, **options: Any) -> "Recording":
             path, f"the format '{name}'", f"one of {', '.join(FORMATS)}", "one of these"
         )
     recording = FORMATS[name].load(path, **options)
+    given = {key: list(v) if isinstance(v, tuple) else v for key, v in options.items()}
     imported = {
         "format": name,
         "source": Path(path).name,
-        **{
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in options.items()
-        },
+        **given,
         "account": {label: account.as_dict() for label, account in recording.intake.items()},
     }
     return recording.replace(info={**recording.info, "imported": imported})

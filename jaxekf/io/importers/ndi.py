@@ -191,12 +191,8 @@ def _groups(export: Export, header: HeaderLine) -> list[_ToolColumns]:
     begins = [max((p for p in ports if p < q), default=None) for q in poses]
     several = len(poses) > 1
     if several and (None in begins or len(set(begins)) < len(poses)):
-        raise export.error(
-            header,
-            f"{len(poses)} poses with {len(ports)} names of tools (such as Port 1)",
-            "one before each",
-            "exporting one tool",
-        )
+        got = f"{len(poses)} poses with {len(ports)} names of tools (such as Port 1)"
+        raise export.error(header, got, "one before each", "exporting one tool")
     shared = (begins[0] or 0) if several else 0
     groups = []
     for k, (begin, pose) in enumerate(zip(begins, poses, strict=True)):
@@ -220,12 +216,9 @@ def _group(
     for wanted in _POSE:
         found = next((i for i in range(pose, end) if names[i] == wanted), None)
         if found is None:
-            raise export.error(
-                header,
-                f"no column {wanted.title()} after {header.cells[pose]}",
-                "Q0,Qx,Qy,Qz,Tx,Ty,Tz",
-                "exporting again with quaternions and positions",
-            )
+            got = f"no column {wanted.title()} after {header.cells[pose]}"
+            hint = "exporting again with quaternions and positions"
+            raise export.error(header, got, "Q0,Qx,Qy,Qz,Tx,Ty,Tz", hint)
         columns.append(found)
 
     def before(*wanted: str, prefix: str = "\n") -> int | None:
@@ -276,13 +269,8 @@ def _stamped(
         sentence = f"Times are the column '{label}' in {unit} ({stated})"
         return stamped_rows(table, *times_or_blank(table, label, _TICKS[unit])), sentence
     if group.frame is None:
-        raise table.place.error(
-            None,
-            None,
-            f"columns {','.join(header.cells[:12])}",
-            "a time or a frame number",
-            "exporting it",
-        )
+        got = f"columns {','.join(header.cells[:12])}"
+        raise table.place.error(None, None, got, "a time or a frame number", "exporting it")
     rate = Decimal(repr(float(RATE_HZ if rate_hz is None else rate_hz)))
     if not (rate.is_finite() and rate > 0):
         raise table.place.error(None, None, f"a rate of {rate} Hz", "one over 0", "--rate 60")

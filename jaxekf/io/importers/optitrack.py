@@ -115,12 +115,9 @@ def _facts(export: Export) -> dict[str, str]:
     """Keys, in lower case, and values of the first line."""
     first = export.head[0]
     if first.cells[0].lower() != "format version":
-        raise export.error(
-            first,
-            f"a file that begins with '{first.cells[0]}'",
-            "Format Version, the first line of an export of Motive",
-            "exporting with header information",
-        )
+        got = f"a file that begins with '{first.cells[0]}'"
+        expected = "Format Version, the first line of an export of Motive"
+        raise export.error(first, got, expected, "exporting with header information")
     return {
         key.lower(): value for key, value in zip(first.cells[::2], first.cells[1::2], strict=False)
     }
@@ -136,13 +133,10 @@ def _check(export: Export, facts: dict[str, str]) -> float:
     }
     for key, (value, known) in supported.items():
         if value.lower() not in known:
-            raise export.error(
-                export.head[0],
-                f"{key.title()} {value}",
-                " or ".join(word.title() for word in known),
-                "exporting with that setting",
-                key.title(),
-            )
+            got = f"{key.title()} {value}"
+            expected = " or ".join(word.title() for word in known)
+            hint = "exporting with that setting"
+            raise export.error(export.head[0], got, expected, hint, key.title())
     return METRES[unit.lower()]
 
 
@@ -153,12 +147,9 @@ def _header(export: Export) -> _Header:
         (i for i, line in enumerate(head) if _BODY in {cell.lower() for cell in line.cells}), None
     )
     if axes is None or types is None or types + 2 > axes - 1 or axes < 4:
-        raise export.error(
-            head[0],
-            "no column of the type Rigid Body above a line Frame,Time (Seconds)",
-            _EXPECTED,
-            "exporting rigid bodies with header information",
-        )
+        got = "no column of the type Rigid Body above a line Frame,Time (Seconds)"
+        hint = "exporting rigid bodies with header information"
+        raise export.error(head[0], got, _EXPECTED, hint)
     if not any(cell.lower()[:4] == "time" for cell in head[axes].cells):
         raise export.error(head[axes], "no column Time (Seconds)", "one", "exporting again")
     width = max(len(line.cells) for line in head[types : axes + 1])
@@ -177,10 +168,7 @@ def _bodies(export: Export, header: _Header) -> tuple[list[str], list[dict[str, 
     whole = {name: group for name, group in found.items() if set(_COLUMNS) <= set(group)}
     if found and not whole:
         lacking = sorted(set(_COLUMNS) - set(next(iter(found.values()))))
-        raise export.error(
-            header.axes,
-            f"a rigid body without {', '.join(lacking)}",
-            "rotation X, Y, Z, W and position X, Y, Z",
-            "exporting both, rotations as quaternions",
-        )
+        got = f"a rigid body without {', '.join(lacking)}"
+        expected = "rotation X, Y, Z, W and position X, Y, Z"
+        raise export.error(header.axes, got, expected, "exporting both, rotations as quaternions")
     return list(whole), list(whole.values())

@@ -62,12 +62,9 @@ def load(path: Path | str) -> Recording:
     above, below = (export.head + 2 * [export.head[0]])[:2]
     heads = [title if i == 0 or title != titles[i - 1] else "" for i, title in enumerate(titles)]
     if above.cells != stripped(heads) or below.cells != [x for _, parts in _HEADER for x in parts]:
-        raise export.error(
-            above,
-            f"a header {export.delimiter.join(above.cells)}",
-            export.delimiter.join(stripped(heads)),
-            "a file of RepoIMU as it is published",
-        )
+        got = f"a header {export.delimiter.join(above.cells)}"
+        expected = export.delimiter.join(stripped(heads))
+        raise export.error(above, got, expected, "a file of RepoIMU as it is published")
     table = export.table(below, len(titles)).named({0: labels[0]})
     source = stamped_rows(table, *times_or_blank(table, labels[0], NANOSECONDS))
     values = source.floats(range(1, len(labels)), labels[1:])
@@ -85,7 +82,7 @@ def load(path: Path | str) -> Recording:
         optical, account = screening.optical(place, time_ns, values[:, :4])
     # Semicolons are this format's own delimiter and need no note.
     accounts = {
-        label: replace(accounted(one, source), notes=one.notes)
+        label: replace(accounted(one, source.table, source.dropped), notes=one.notes)
         for label, one in (("imu", imu_account), ("optical", account))
     }
     return Recording(

@@ -132,19 +132,13 @@ def _choose(
             bag.path, f"no topic of {JOINT}", "one for the joint", f"a topic of {_listed(bag)}"
         )
     if child_frame is not None and chosen["pose"] is None:
-        raise RecordingError(
-            bag.path,
-            "no topic of transforms",
-            f"one for the frame '{child_frame}'",
-            f"a topic of {_listed(bag)}",
-        )
+        got = "no topic of transforms"
+        expected = f"one for the frame '{child_frame}'"
+        raise RecordingError(bag.path, got, expected, f"a topic of {_listed(bag)}")
     if not any(chosen.values()):
-        raise RecordingError(
-            bag.path,
-            f"topics of {_listed(bag)}",
-            f"at least one of {', '.join((IMU, *POSES))}",
-            "recording such a topic, or naming one of a transform tree (pose='/tf', --pose /tf)",
-        )
+        got = f"topics of {_listed(bag)}"
+        hint = "recording such a topic, or naming one of a transform tree (pose='/tf', --pose /tf)"
+        raise RecordingError(bag.path, got, f"at least one of {', '.join((IMU, *POSES))}", hint)
     for label, topic in chosen.items():
         if topic is not None:
             source.info[f"{label}_topic"] = topic.name
@@ -163,23 +157,15 @@ def _topic(bag: Bag, label: str, types: Sequence[str], name: str | None) -> Topi
         found = [t for t in of_name if t.type in types]
         if not found:
             got = f"type {', '.join(t.type for t in of_name)}" if of_name else "no such topic"
-            raise RecordingError(
-                f"{bag.path}:{name}",
-                got,
-                f"a topic of {' or '.join(types)}",
-                f"a topic of {_listed(bag)}",
-            )
+            expected = f"a topic of {' or '.join(types)}"
+            raise RecordingError(f"{bag.path}:{name}", got, expected, f"a topic of {_listed(bag)}")
     else:
         # Static transforms are no recording of motion.
         found = [t for t in bag.topics if t.type in types and t.stated and t.name != "/tf_static"]
     if len(found) > 1:
         listed = ", ".join(f"{t.name} ({t.type}, {t.stated})" for t in found)
-        raise RecordingError(
-            bag.path,
-            f"{len(found)} topics for {label}: {listed}",
-            "one",
-            f"naming it ({label}='{found[0].name}', --{label} {found[0].name})",
-        )
+        hint = f"naming it ({label}='{found[0].name}', --{label} {found[0].name})"
+        raise RecordingError(bag.path, f"{len(found)} topics for {label}: {listed}", "one", hint)
     return found[0] if found else None
 
 

@@ -114,12 +114,9 @@ def _section(export: Export) -> list[HeaderLine]:
         )
     lines = export.lines(found.start(), 5)
     if len(lines) < 5:
-        raise export.error(
-            lines[0],
-            f"{len(lines) - 1} lines below '{lines[0].cells[0]}'",
-            "rate, names, columns, units and samples",
-            "exporting again",
-        )
+        got = f"{len(lines) - 1} lines below '{lines[0].cells[0]}'"
+        expected = "rate, names, columns, units and samples"
+        raise export.error(lines[0], got, expected, "exporting again")
     return lines
 
 
@@ -138,12 +135,9 @@ def _period(export: Export, line: HeaderLine) -> Decimal:
 def _columns(export: Export, line: HeaderLine) -> list[str]:
     columns = [cell.lower() for cell in line.cells]
     if columns[:1] != ["frame"]:
-        raise export.error(
-            line,
-            f"columns {','.join(line.cells[:8])}",
-            "Frame,Sub Frame,RX,RY,RZ[,RW],TX,TY,TZ",
-            "exporting objects or segments",
-        )
+        got = f"columns {','.join(line.cells[:8])}"
+        expected = "Frame,Sub Frame,RX,RY,RZ[,RW],TX,TY,TZ"
+        raise export.error(line, got, expected, "exporting objects or segments")
     return columns
 
 

@@ -22,6 +22,7 @@ from jaxekf.io._frame_rows import (
     dense_frames,
     frames,
     part_of_each_line,
+    part_sheet,
 )
 from jaxekf.io.csv_table import (
     POSITION,
@@ -35,7 +36,7 @@ from jaxekf.io.csv_table import (
 )
 from jaxekf.io.schema import FLAG, TEXT, Field, Option, StreamSchema, latency
 from jaxekf.recordings import facts, screening
-from jaxekf.recordings.accounts import Indices, Intake, Place
+from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Camera, Floats
 
 LANDMARKS = "landmark,x,y,z"
@@ -57,16 +58,14 @@ def _read(table: Table, source: description.Source, landmarks: Table) -> tuple[C
     names, p_ref_landmark = _places(landmarks, length)
     pixel, sigma = numbers(table, ("u", "v"), blank=True), reported(table, "sigma")
     _check_sigma(table.place, sigma)
-    landmark = _landmark_of_each_line(table, names, landmarks)
+    file = landmarks.path.name
+    listed = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+    expected = f"one whose place is given in {file} ({listed})"
+    hint = f"adding its line, {LANDMARKS}, to {file}"
+    landmark = part_of_each_line(table, "landmark", names, expected, lambda _: hint)
     columns = [pixel] if sigma is None else [pixel, sigma]
-    made, account = frames(
-        table,
-        columns,
-        landmark,
-        names,
-        sort=source.sort,
-        slowest_s=screening.SLOWEST_TRACKER_S,
-    )
+    slowest_s = screening.SLOWEST_TRACKER_S
+    made, account = frames(table, columns, landmark, names, sort=source.sort, slowest_s=slowest_s)
     found, account = screening.judge_points(
         table.place.take(made.lines), made.times, pixel[made.lines], account
     )
@@ -95,23 +94,14 @@ def _write(stream: Camera, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any]
     _check_sigma(Place("camera"), stream.sigma)
     seen = stream.usable
     if not seen.any():
-        raise RecordingError(
-            "camera",
-            f"no landmark in any of {len(seen)} images",
-            "at least one",
-            "leaving the stream out where nothing is seen",
-        )
-    columns = ["landmark", "u", "v"]
-    values = [np.where(seen[..., None], stream.pixel, np.nan).reshape(-1, 2)]
-    if stream.sigma is not None:
-        columns.append("sigma")
-        values.append(stream.sigma.reshape(-1, 1))
+        got = f"no landmark in any of {len(seen)} images"
+        hint = "leaving the stream out where nothing is seen"
+        raise RecordingError("camera", got, "at least one", hint)
+    pixel = np.where(seen[..., None], stream.pixel, np.nan)
     entries = {key: getattr(stream, key) for key in _OPTICS}
     about |= {**SCHEMA.described} | description.latency_entry(stream.latency_ns)
     about |= {key: value.tolist() for key, value in _optics(entries, facts.FILE, "camera.").items()}
-    images, count = seen.shape
-    times = np.repeat(stream.time_ns, count)
-    return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * images), about
+    return part_sheet(stream, "landmark", ("u", "v"), pixel, "sigma"), about
 
 
 def _write_landmarks(stream: Camera, path: Path) -> None:
@@ -133,22 +123,14 @@ def _optics(entries: Mapping[str, Any], place: Path | str, head: str = "") -> di
     found = {}
     for key in ("focal", "centre"):
         if key not in entries:
-            raise RecordingError(
-                place,
-                f"no {head}{key}",
-                "two numbers of pixels",
-                f"adding {key} = [{key[0]}x, {key[0]}y] under [camera]",
-                column=f"{head}{key}",
-            )
+            hint = f"adding {key} = [{key[0]}x, {key[0]}y] under [camera]"
+            whole = f"{head}{key}"
+            raise RecordingError(place, f"no {whole}", "two numbers of pixels", hint, column=whole)
         found[key] = facts.finite_vector(entries[key], 2, place, f"{head}{key}")
     if (found["focal"] <= 0.0).any():
-        raise RecordingError(
-            place,
-            f"{head}focal = {found['focal'].tolist()}",
-            "two positive numbers of pixels",
-            "turning the image, not the focal length",
-            column=f"{head}focal",
-        )
+        focal, hint = found["focal"].tolist(), "turning the image, not the focal length"
+        expected = "two positive numbers of pixels"
+        raise facts.wrong_entry(place, f"{head}focal", focal, expected, hint)
     for key, size in (("radial", 2), ("p_body_camera", 3)):
         if key in entries:
             found[key] = facts.finite_vector(entries[key], size, place, f"{head}{key}")
@@ -167,13 +149,9 @@ def _check_sigma(place: Place, sigma: Floats | None) -> None:
     if bad.size:
         at = tuple(int(i) for i in bad[0])
         hint = "blanking the cell" if place.unit == "line" else "writing NaN"
-        raise place.error(
-            at[0],
-            "sigma",
-            f"{sigma[at]}",
-            "a finite number of pixels, more than 0",
-            f"{hint}, which means that none was reported",
-        )
+        hint += ", which means that none was reported"
+        expected = "a finite number of pixels, more than 0"
+        raise place.error(at[0], "sigma", f"{sigma[at]}", expected, hint)
 
 
 def _screen(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Camera, Intake]:
@@ -213,55 +191,23 @@ def _check_places(place: Place, places: Floats) -> None:
     bad = np.flatnonzero(~np.isfinite(places).all(axis=1))
     if bad.size:
         at = int(bad[0])
-        raise place.error(
-            at,
-            "p_ref_landmark",
-            f"{places[at].tolist()}",
-            "3 finite numbers",
-            "giving the landmark its place, or leaving it out",
-        )
+        got, hint = f"{places[at].tolist()}", "giving the landmark its place, or leaving it out"
+        raise place.error(at, "p_ref_landmark", got, "3 finite numbers", hint)
 
 
 def _places(table: Table, length: float) -> tuple[tuple[str, ...], Floats]:
     """Names (L) and places (L, 3), metres, of `landmarks.csv`."""
     need_columns(table, LANDMARKS)
     if table.text.cut:
-        raise RecordingError(
-            table.path,
-            "a last line that is cut short",
-            LANDMARKS,
-            "completing the line or removing it",
-            line=table.text.cut[0],
-        )
+        got, hint = "a last line that is cut short", "completing the line or removing it"
+        raise RecordingError(table.path, got, LANDMARKS, hint, line=table.text.cut[0])
     names = tuple(str(name) for name in words(table, "landmark"))
     bad = bad_name(names)
     if bad is not None:
-        raise table.error(
-            bad,
-            "landmark",
-            f"{names[bad]!r}" + (" again" if names[bad] in names[:bad] else ""),
-            NAMES,
-            "renaming the landmark, or removing the line",
-        )
+        got = f"{names[bad]!r}" + (" again" if names[bad] in names[:bad] else "")
+        hint = "renaming the landmark, or removing the line"
+        raise table.error(bad, "landmark", got, NAMES, hint)
     return names, units.scaled(finite_numbers(table, POSITION), length)
-
-
-def _landmark_of_each_line(table: Table, names: tuple[str, ...], places: Table) -> Indices:
-    """Index (N,) into `names` of the landmark that each line is of."""
-
-    def unknown(row: int, name: str) -> RecordingError:
-        listed = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
-        return table.error(
-            row,
-            "landmark",
-            f"landmark '{name}'",
-            f"one whose place is given in {places.path.name} ({listed})",
-            f"adding its line, {LANDMARKS}, to {places.path.name}"
-            if name
-            else "naming the landmark or removing the line",
-        )
-
-    return part_of_each_line(table, "landmark", names, unknown)
 
 
 def _optic(size: int, unit: str, about: str, *, frame: str = "", needed: bool = False) -> Field:

@@ -7,12 +7,12 @@ time. A marker without a line, or with blank x,y,z, is hidden.
 import json
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxekf._support.errors import RecordingError
 from jaxekf.io import description, units
 from jaxekf.io._frame_rows import (
     NAMES,
@@ -21,11 +21,12 @@ from jaxekf.io._frame_rows import (
     dense_frames,
     frames,
     part_of_each_line,
+    part_sheet,
 )
 from jaxekf.io.csv_table import POSITION, Sheet, Table, numbers, reported
 from jaxekf.io.schema import FLAG, TEXT, Field, Option, StreamSchema, latency
 from jaxekf.recordings import facts, screening
-from jaxekf.recordings.accounts import Indices, Intake, Place
+from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Floats, Markers
 
 
@@ -42,7 +43,9 @@ def _read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     position = length * numbers(table, POSITION, blank=True)
     error = reported(table, "error", least=0.0)
     error = None if error is None else length * error
-    quality, marker = reported(table, "quality"), _marker_of_each_line(table, names)
+    quality = reported(table, "quality")
+    expected = f"one whose place in the body is given ({', '.join(names)})"
+    marker = part_of_each_line(table, "marker", names, expected, _adding)
     columns = [a for a in (position, quality, error) if a is not None]
     made, account = frames(table, columns, marker, names, sort=source.sort)
     seen, account = screening.judge_markers(
@@ -50,6 +53,7 @@ def _read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
     )
     position[made.lines[~seen]] = np.nan
     position = made.spread(position)
+    least = facts.finite_number(about.get("quality_min", 0.0), place, "markers.quality_min")
     stream = Markers(
         made.time_ns,
         position,
@@ -57,9 +61,7 @@ def _read(table: Table, source: description.Source) -> tuple[Markers, Intake]:
         names,
         p_body_marker,
         quality=None if quality is None else made.spread(quality),
-        quality_min=facts.finite_number(
-            about.get("quality_min", 0.0), place, "markers.quality_min"
-        ),
+        quality_min=least,
         error=None if error is None else made.spread(error),
         latency_ns=description.latency_ns(about, "markers", place),
     )
@@ -72,15 +74,8 @@ def _write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
     A marker that is not visible, or has no finite position, gets blank cells.
     """
     _check_names(stream.names, facts.FILE)
-    frames, count = stream.visible.shape
     seen = stream.visible & np.isfinite(stream.position).all(axis=2)
-    columns = ["marker", *POSITION]
-    values = [np.where(seen[..., None], stream.position, np.nan).reshape(-1, 3)]
-    for key in ("quality", "error"):
-        numbers = getattr(stream, key)
-        if numbers is not None:
-            columns.append(key)
-            values.append(numbers.reshape(-1, 1))
+    position = np.where(seen[..., None], stream.position, np.nan)
     about |= {**SCHEMA.described} | description.latency_entry(stream.latency_ns)
     if stream.quality_min:
         about["quality_min"] = float(stream.quality_min)
@@ -88,8 +83,7 @@ def _write(stream: Markers, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
         name: facts.finite_vector(p, 3, facts.FILE, f"markers.geometry.{name}").tolist()
         for name, p in zip(stream.names, stream.p_body_marker, strict=True)
     }
-    times = np.repeat(stream.time_ns, count)
-    return Sheet(columns, times, np.concatenate(values, axis=1), stream.names * frames), about
+    return part_sheet(stream, "marker", POSITION, position, "quality", "error"), about
 
 
 def _screen(place: Place, group: Mapping[str, Any], sort: bool) -> tuple[Markers, Intake]:
@@ -130,9 +124,7 @@ def _geometry(geometry: Any, place: Path | str) -> tuple[tuple[str, ...], Floats
     """Names (M) and places in the body (M, 3)."""
     key = "markers.geometry"
     if geometry is not None and not isinstance(geometry, dict):
-        raise RecordingError(
-            place, f"{key} = {geometry!r}", "a section", f"writing it as [{key}]", column=key
-        )
+        raise facts.wrong_entry(place, key, geometry, "a section", f"writing it as [{key}]")
     geometry = geometry or {}
     _check_names(tuple(geometry), place)
     places = [facts.finite_vector(p, 3, place, f"{key}.{name}") for name, p in geometry.items()]
@@ -141,42 +133,19 @@ def _geometry(geometry: Any, place: Path | str) -> tuple[tuple[str, ...], Floats
 
 def _check_names(names: tuple[str, ...], place: Path | str) -> None:
     """Names are what a cell of a CSV file can hold and give back, each once, and at least one."""
-    key = "markers.geometry"
+    error = partial(Place(place).error, None, "markers.geometry")
     if not names:
-        raise RecordingError(
-            place,
-            "no marker's place in the body",
-            "at least one",
-            f"adding NAME = [x, y, z], in metres, under [{key}]",
-            column=key,
-        )
+        hint = "adding NAME = [x, y, z], in metres, under [markers.geometry]"
+        raise error("no marker's place in the body", "at least one", hint)
     bad = bad_name(names)
     if bad is not None:
-        raise RecordingError(
-            place,
-            f"{names[bad]!r} as marker {bad + 1}",
-            NAMES,
-            "renaming the marker",
-            column=key,
-        )
+        raise error(f"{names[bad]!r} as marker {bad + 1}", NAMES, "renaming the marker")
 
 
-def _marker_of_each_line(table: Table, names: tuple[str, ...]) -> Indices:
-    """Index (N,) into `names` of the marker that each line is of."""
-
-    def unknown(row: int, name: str) -> RecordingError:
-        key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-        return table.error(
-            row,
-            "marker",
-            f"marker '{name}'",
-            f"one whose place in the body is given ({', '.join(names)})",
-            f"adding {key} = [x, y, z], in metres, under [markers.geometry] in {facts.FILE}"
-            if name
-            else "naming the marker or removing the line",
-        )
-
-    return part_of_each_line(table, "marker", names, unknown)
+def _adding(name: str) -> str:
+    """Remedy for a marker without a place in the body."""
+    key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+    return f"adding {key} = [x, y, z], in metres, under [markers.geometry] in {facts.FILE}"
 
 
 SCHEMA = StreamSchema(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxekf.estimation.result import Estimate
+from jaxekf.estimation.result import Estimate, Estimated
 from jaxekf.evaluation.metrics import attitude_error, hold_last
 from jaxekf.recordings.sample_selection import fill_gaps
 from jaxekf.recordings.truth import encoder_at
@@ -20,20 +20,19 @@ from jaxekf.reporting.plots._measurements import (
     truth,
 )
 from jaxekf.reporting.plots._registry import figure, has_output
+from jaxekf.reporting.plots._vectors import Measured, Vector, draw
 from jaxekf.reporting.plots.style import (
     AXES,
     ESTIMATE,
     HELD,
-    MEASURED,
     TRUTH,
     band,
     finish,
     new_grid,
     styled,
-    symmetric_limits,
 )
 
-_ANGLES = ("roll", "pitch", "yaw")
+ANGLES = ("roll", "pitch", "yaw")
 _POSE = {
     "tracker": "pose from the tracker",
     "pose of the markers": "pose of the markers",
@@ -72,28 +71,39 @@ def euler_sigma_deg(q: Floats, cov: Floats) -> Floats:
 @figure(has_output("attitude"))
 def attitude(estimate: Estimate, recording: Recording) -> Figure:
     """Roll, pitch and yaw on the left; errors with the 2 sigma band on the right."""
-    poses, known = pose_measurements(estimate, recording), truth(estimate, recording)
-    t, estimated = estimate.time, euler_deg(estimate.attitude.value)
-    sigma = euler_sigma_deg(estimate.attitude.value, estimate.attitude.cov)
-    measured = same_turn(poses.pose.q_ref_body[poses.seen], poses.t, t, estimated)
-    with styled():
-        drawn, grid = new_grid(3, 1 if known is None else 2, (11, 6.5), sharex=True)
-        for i, name in enumerate(_ANGLES):
-            axes = grid[i, 0]
-            shade(axes, poses)
-            if poses.t.size:
-                axes.plot(poses.t, measured[:, i], ".", ms=2.5, color=MEASURED, label=poses.label)
-            if known is not None:
-                angles = same_turn(known.q_ref_body, t, t, estimated)
-                angles[~known.valid] = np.nan
-                axes.plot(t, angles[:, i], color=TRUTH, lw=2.2, label="encoder")
-            band(axes, t, estimated[:, i], sigma[:, i], "2σ of the estimate")
-            axes.plot(t, estimated[:, i], color=ESTIMATE, lw=1, label="estimate")
-            axes.set_ylabel(f"{name} (deg)")
-        if known is not None:
-            _errors(grid[:, 1], estimate, recording, poses, known)
-        finish(drawn, grid, f"{estimate.run}: attitude of the body in {poses.frame}")
-    return drawn
+    poses = pose_measurements(estimate, recording)
+    vector = attitude_vector(estimate, recording, poses if poses.t.size else None)
+    names = "{} (deg)", "error about {} (deg)"
+    title = f"{estimate.run}: attitude of the body in {poses.frame}"
+    style = {"width": 1.0, "alpha": 0.6}
+    return draw(estimate, poses, vector, names, title, limits=False, error_style=style)
+
+
+def attitude_vector(
+    estimate: Estimated, recording: Recording | None, poses: PoseMeasurements | None
+) -> Vector:
+    """Roll, pitch and yaw in degrees; errors as rotation vectors in the body frame."""
+    output, t = estimate.outputs["attitude"], estimate.time
+    angles, known = euler_deg(output.value), truth(recording, estimate.time_ns)
+    true = error = measured = None
+    if known is not None:
+        true = same_turn(known.q_ref_body, t, t, angles)
+        true[~known.valid] = np.nan
+        error = _error_deg(known, output.value)
+    if poses is not None:
+        raw = poses.pose.q_ref_body[poses.seen]
+        there = truth(recording, poses.pose.time_ns[poses.seen])
+        off = None if there is None else _error_deg(there, raw)
+        measured = Measured(poses.t, same_turn(raw, poses.t, t, angles), off, poses.label)
+    sigma, error_sigma = euler_sigma_deg(output.value, output.cov), np.rad2deg(output.sigma)
+    return Vector(ANGLES, "deg", angles, sigma, true, error, error_sigma, measured)
+
+
+def _error_deg(known: Encoder, q: Floats) -> Floats:
+    """Attitude errors (N, 3) in degrees, rotation vectors in the body frame; NaN where unknown."""
+    error = np.rad2deg(attitude_error(known.q_ref_body, q))
+    error[~known.valid] = np.nan
+    return error
 
 
 def same_turn(q: Floats, t: Floats, t_near: Floats, near: Floats) -> Floats:
@@ -108,31 +118,6 @@ def same_turn(q: Floats, t: Floats, t_near: Floats, near: Floats) -> Floats:
     return angles + 360.0 * np.round((there - angles) / 360.0)
 
 
-def _errors(
-    column: Any, estimate: Estimate, recording: Recording, poses: PoseMeasurements, known: Encoder
-) -> None:
-    """Attitude errors of estimate and measurement, as rotation vectors in the body frame."""
-    measured = np.zeros((0, 3))
-    if poses.t.size:
-        there = encoder_at(recording.need_encoder(), poses.pose.time_ns[poses.seen])
-        measured = np.rad2deg(attitude_error(there.q_ref_body, poses.pose.q_ref_body[poses.seen]))
-        measured[~there.valid] = np.nan
-    error = np.rad2deg(attitude_error(known.q_ref_body, estimate.attitude.value))
-    error[~known.valid] = np.nan
-    sigma = np.rad2deg(estimate.attitude.sigma)
-    for i, axis in enumerate(AXES):
-        axes = column[i]
-        shade(axes, poses)
-        if poses.t.size:
-            axes.plot(
-                poses.t, measured[:, i], ".", ms=2.5, color=MEASURED, alpha=0.6, label=poses.label
-            )
-        band(axes, estimate.time, np.zeros(len(error)), sigma[:, i], "2σ of the estimate")
-        axes.plot(estimate.time, error[:, i], color=ESTIMATE, lw=1, label="estimate")
-        axes.set_ylabel(f"error about {axis} (deg)")
-        symmetric_limits(axes, np.r_[error[:, i], measured[:, i]])
-
-
 @figure(lambda e, r: "attitude" in e.outputs and pose_measurements(e, r).t.size > 0)
 def occlusion(estimate: Estimate, recording: Recording) -> Figure:
     """Close-up of the longest time without a pose: the estimate, and the last pose held."""
@@ -143,14 +128,14 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
     dense = dense[_within(seconds(dense, estimate), (max(window[0], 0.0), window[1]))]
     t_held, held = seconds(dense, estimate), hold_last(poses.pose, dense)
     near = _within(estimate.time, window)
-    known = truth(estimate, recording)
+    known = truth(recording, estimate.time_ns)
     with styled():
         drawn, grid = new_grid(3, 1 if known is None else 2, (11, 6.5), sharex=True)
         t, estimated = estimate.time[near], estimate.attitude.value[near]
         angles = euler_deg(estimated)
         sigma = euler_sigma_deg(estimated, estimate.attitude.cov[near])
         held_angles = same_turn(held, t_held, t, angles)
-        for i, name in enumerate(_ANGLES):
+        for i, name in enumerate(ANGLES):
             axes = grid[i, 0]
             shade(axes, poses)
             _hold(axes, t_held, held_angles[:, i])
@@ -163,13 +148,14 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
             axes.set_ylabel(f"{name} (deg)")
             axes.set_xlim(*window)
         if known is not None:
-            there = encoder_at(recording.need_encoder(), dense)
-            hold_error = np.rad2deg(attitude_error(there.q_ref_body, held))
-            hold_error[~there.valid] = np.nan
+            hold_error = _error_deg(encoder_at(recording.need_encoder(), dense), held)
+            error = _error_deg(known, estimate.attitude.value)[near]
+            sigma = np.rad2deg(estimate.attitude.sigma[near])
             for i, axes in enumerate(grid[:, 1]):
                 shade(axes, poses)
                 _hold(axes, t_held, hold_error[:, i])
-                _close_error(axes, estimate, known, near, i)
+                _close_error(axes, t, error[:, i], sigma[:, i])
+                axes.set_ylabel(f"error about {AXES[i]} (deg)")
                 _annotate_worst(axes, hold_error[:, i])
         title = f"{estimate.run}: no {_POSE[poses.label]} for {span[1] - span[0]:.2f} s"
         finish(drawn, grid, title)
@@ -184,14 +170,10 @@ def _hold(axes: Any, t: Floats, values: Floats) -> None:
     axes.step(t, values, where="post", color=HELD, lw=1, label="last pose held")
 
 
-def _close_error(axes: Any, estimate: Estimate, known: Encoder, near: Flags, i: int) -> None:
+def _close_error(axes: Any, t: Floats, error: Floats, sigma: Floats) -> None:
     """The error about one axis within the window, with limits that include all of it."""
-    t, sigma = estimate.time[near], np.rad2deg(estimate.attitude.sigma[near, i])
-    error = np.rad2deg(attitude_error(known.q_ref_body[near], estimate.attitude.value[near]))[:, i]
-    error[~known.valid[near]] = np.nan
     band(axes, t, np.zeros(len(t)), sigma, "2σ of the estimate")
     axes.plot(t, error, color=ESTIMATE, lw=1.2, label="estimate")
-    axes.set_ylabel(f"error about {AXES[i]} (deg)")
     largest = np.abs(error[np.isfinite(error)]).max(initial=0.0)
     reach = 1.3 * max(2.0 * sigma.max(), largest, 0.3)
     axes.set_ylim(-reach, reach)

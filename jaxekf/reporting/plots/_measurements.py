@@ -59,11 +59,11 @@ def seconds(time_ns: Times, estimate: Estimated) -> Floats:
     return (time_ns - estimate.time_ns[0]) / NANOSECONDS
 
 
-def truth(estimate: Estimated, recording: Recording) -> Encoder | None:
-    """The encoder at the estimate's instants."""
-    if recording.encoder is None:
+def truth(recording: Recording | None, time_ns: Times) -> Encoder | None:
+    """The encoder at some times; None without a recording or an encoder."""
+    if recording is None or recording.encoder is None:
         return None
-    return encoder_at(recording.encoder, estimate.time_ns)
+    return encoder_at(recording.encoder, time_ns)
 
 
 def pose_measurements(estimate: Estimated, recording: Recording) -> PoseMeasurements:

@@ -19,9 +19,11 @@ from jaxekf.reporting.plots.style import (
     REFUSED,
     TRUTH,
     band,
+    beside,
     finish,
     new_figure,
     new_grid,
+    stretches,
     styled,
 )
 
@@ -95,17 +97,13 @@ def _line(axes: Any, line: int, t: Floats, width: float, usage: _Usage) -> None:
     shares = [100.0 * part.mean() if part.size else 0.0 for part in usage]
     words = zip(shares, ("used", "refused", "hidden"), strict=True)
     text = "\n".join(f"{share:.1f} % {word}" for share, word in words)
-    axes.text(1.01, line, text, transform=axes.get_yaxis_transform(), va="center", fontsize=8)
+    beside(axes, line, text)
 
 
 def _stretches(t: Floats, chosen: Flags, width: float) -> list[tuple[float, float]]:
     """Begin and length in seconds of intervals of chosen frames; a frame lasts until the next."""
-    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int)))
     ends = np.append(t[1:], t[-1:] + width)
-    return [
-        (float(t[a]), float(ends[b - 1] - t[a]))
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
-    ]
+    return [(float(t[a]), float(ends[b - 1] - t[a])) for a, b in stretches(chosen)]
 
 
 @figure(_has_marker_sensors)

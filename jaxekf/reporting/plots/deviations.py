@@ -39,22 +39,9 @@ def allan(noise: StaticNoise) -> Figure:
 def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
     curve = sensor.curve
     for i, (axis, colour) in enumerate(zip(AXES, _COLOURS, strict=True)):
-        axes.fill_between(
-            curve.tau,
-            turn * curve.low[:, i],
-            turn * curve.high[:, i],
-            color=colour,
-            alpha=0.2,
-            lw=0,
-        )
-        axes.plot(
-            curve.tau,
-            turn * curve.deviation[:, i],
-            "o",
-            color=colour,
-            ms=3,
-            label=f"{axis}, 95 % band",
-        )
+        low, found, high = (turn * v[:, i] for v in (curve.low, curve.deviation, curve.high))
+        axes.fill_between(curve.tau, low, high, color=colour, alpha=0.2, lw=0)
+        axes.plot(curve.tau, found, "o", color=colour, ms=3, label=f"{axis}, 95 % band")
     for noise, colour in zip(sensor.axes, _COLOURS, strict=True):
         # Averaging times below a period of the highest frequency used are not part of the fit.
         tau = curve.tau[curve.tau >= 0.9 * min(0.5 / noise.band_hz, curve.tau[-1])]
@@ -63,9 +50,7 @@ def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     # The bands, not the slopes, determine the limits; at least a decade, so that the scale has labels.
-    low, high = (
-        turn * float(f(getattr(curve, part))) for f, part in ((np.min, "low"), (np.max, "high"))
-    )
+    low, high = turn * float(np.min(curve.low)), turn * float(np.max(curve.high))
     if high > 0.0:
         low = max(low, 1e-6 * high)
         middle, reach = np.sqrt(low * high), max(1.3 * np.sqrt(high / low), np.sqrt(10.0))

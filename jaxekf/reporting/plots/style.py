@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
 from jaxekf.io.atomic import whole_file
-from jaxekf.recordings.types import Floats
+from jaxekf.recordings.types import Flags, Floats
 
 ESTIMATE, MEASURED, TRUTH, HELD = "#0b5394", "#e69138", "#222222", "#a61c00"
 REFUSED, HIDDEN = "#cc0000", "#d9d9d9"
@@ -53,6 +53,17 @@ def band(axes: Any, t: Floats, centre: Floats, sigma: Floats, label: str | None)
     axes.fill_between(
         t, centre - 2 * sigma, centre + 2 * sigma, color=ESTIMATE, alpha=0.22, lw=0, label=label
     )
+
+
+def beside(axes: Any, lane: int, text: str) -> None:
+    """Print a text to the right of a lane."""
+    at = axes.get_yaxis_transform()
+    axes.text(1.01, lane, text, transform=at, va="center", fontsize=8)
+
+
+def stretches(chosen: Flags) -> Any:
+    """First index and last, exclusive, of each stretch of chosen samples (M, 2)."""
+    return np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int))).reshape(-1, 2)
 
 
 def symmetric_limits(axes: Any, values: Floats) -> None:

@@ -8,7 +8,7 @@ from matplotlib.patches import Patch
 
 from jaxekf.checks.inspection import Inspection, StreamSummary
 from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Recording, Times
-from jaxekf.reporting.plots.style import ESTIMATE, REFUSED, new_figure, styled
+from jaxekf.reporting.plots.style import ESTIMATE, REFUSED, beside, new_figure, stretches, styled
 
 _BINS = 400
 _HEIGHT = 0.72
@@ -45,14 +45,7 @@ def time_axis(recording: Recording, found: Inspection) -> Figure:
                 colour = colours.setdefault(reason, _COLOURS[len(colours) % len(_COLOURS)])
                 spans = [_bar(a, b, least) for a, b in _stretches(t, flags)]
                 axes.broken_barh(spans, _upper(line), color=colour, lw=0, zorder=4)
-            axes.text(
-                1.01,
-                line,
-                _summary_text(summary),
-                transform=axes.get_yaxis_transform(),
-                va="center",
-                fontsize=8,
-            )
+            beside(axes, line, _summary_text(summary))
         axes.set_yticks(range(len(lanes)), list(lanes))
         axes.tick_params(axis="y", length=0)
         axes.set_ylim(len(lanes) - 0.45, -0.55)
@@ -138,9 +131,7 @@ def _bar(begin: float, end: float, least: float) -> tuple[float, float]:
 
 
 def _stretches(t: Floats, chosen: Flags) -> list[tuple[float, float]]:
-    edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int)))
-    ends = np.minimum(edges[1::2], len(t) - 1)
-    return [(float(t[a]), float(t[b])) for a, b in zip(edges[::2], ends, strict=True)]
+    return [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in stretches(chosen)]
 
 
 def _summary_text(summary: StreamSummary) -> str:

@@ -5,20 +5,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxekf.evaluation.metrics import attitude_error
-from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
-from jaxekf.recordings.types import Floats
-from jaxekf.reporting import plots
-from jaxekf.reporting.plots._attitudes import euler_deg, same_turn
+from jaxekf.estimation.result import Estimated
+from jaxekf.recordings.types import Floats, Recording
+from jaxekf.reporting.plots._attitudes import attitude_vector
 from jaxekf.reporting.plots._biases import encoder_bias, running_mean
-from jaxekf.reporting.plots._measurements import seconds, truth
+from jaxekf.reporting.plots._measurements import PoseMeasurements
+from jaxekf.reporting.plots._vectors import (
+    Measured,
+    Vector,
+    curve_range,
+    position_vector,
+    rate_vector,
+    velocity_vector,
+)
 from jaxekf.reporting.plots.style import AXES, MEASURED, TRUTH
 from jaxekf.reporting.report._comparison import ComparedResult
 from jaxekf.reporting.report._grid import Column, Grid, Place
 
 _ROW = 168
 _QUANTILE = 0.995
-_ANGLES = ("roll", "pitch", "yaw")
 _BIAS_MEAN_S = 2.0
 _DRAWN_PARTS = ("q_ref_body", "position", "velocity", "rate", "bias", "accelerometer_bias")
 _MOST_OTHERS = 12
@@ -34,153 +39,53 @@ class Figure(NamedTuple):
     """Data and layout for Plotly."""
 
 
-class _Measured(NamedTuple):
-    """A vector measured by a sensor, in the unit it is shown in."""
+class _Quantity(NamedTuple):
+    """A vector that the report shows, if the model has the output."""
 
-    t: Floats
-    value: Floats
-    """(M, 3)."""
-    error: Floats | None
-    """(M, 3) value minus truth, NaN if unknown."""
-    label: str
-    dots: bool
+    title: str
+    caption: str
+    """With ``{}`` for the reference frame."""
+    vector: Callable[[Estimated, Recording | None, PoseMeasurements | None], Vector]
 
 
-class _Vector(NamedTuple):
-    """A vector over time, in the unit it is shown in."""
-
-    labels: tuple[str, ...]
-    """Label of each component."""
-    unit: str
-    value: Floats
-    sigma: Floats
-    truth: Floats | None
-    error: Floats | None
-    error_sigma: Floats
-    measured: _Measured | None
-    noisy: bool = False
-    """Whether the noise of each instant is independent, so that truth is drawn above the estimate."""
+_QUANTITIES = {
+    "attitude": _Quantity(
+        "Attitude",
+        "Rotation from {} to the body by yaw (z), pitch (y) and roll (x). Errors are rotation vectors in"
+        " the body frame, estimate minus encoder.",
+        attitude_vector,
+    ),
+    "rate": _Quantity(
+        "Angular rate",
+        "Angular rate of the tool in the body frame; the gyroscope is shown as recorded.",
+        rate_vector,
+    ),
+    "position": _Quantity("Position", "Position of the body's origin in {}.", position_vector),
+    "velocity": _Quantity("Velocity", "Velocity of the body's origin in {}.", velocity_vector),
+}
 
 
 def draw(compared: ComparedResult, bins: int) -> list[Figure]:
     """All figures of a result and its recording; long series are thinned to `bins` spans of time."""
-    makers: tuple[Callable[[ComparedResult, int], Figure | None], ...] = (
-        attitude,
-        rate,
-        bias,
-        position,
-        velocity,
-        others,
+    drawn = (
+        quantity("attitude", compared, bins),
+        quantity("rate", compared, bins),
+        bias(compared, bins),
+        quantity("position", compared, bins),
+        quantity("velocity", compared, bins),
+        others(compared, bins),
     )
-    return [figure for make in makers if (figure := make(compared, bins)) is not None]
+    return [figure for figure in drawn if figure is not None]
 
 
-def attitude(compared: ComparedResult, bins: int) -> Figure | None:
-    """Roll, pitch and yaw; errors as rotation vectors in the body frame."""
-    output = compared.result.outputs.get("attitude")
-    if output is None:
+def quantity(name: str, compared: ComparedResult, bins: int) -> Figure | None:
+    """An output of the model with measurement, truth and error; None for a model without it."""
+    if name not in compared.result.outputs:
         return None
-    t, angles = compared.result.time, euler_deg(output.value)
-    true = error = measured = None
-    recording, sight = compared.recording, compared.sight
-    known = None if recording is None else truth(compared.result, recording)
-    if known is not None:
-        true = same_turn(known.q_ref_body, t, t, angles)
-        error = np.rad2deg(attitude_error(known.q_ref_body, output.value))
-        true[~known.valid], error[~known.valid] = np.nan, np.nan
-    if sight is not None:
-        raw, off = sight.pose.q_ref_body[sight.seen], None
-        if recording is not None and recording.encoder is not None:
-            there = encoder_at(recording.encoder, sight.pose.time_ns[sight.seen])
-            off = np.rad2deg(attitude_error(there.q_ref_body, raw))
-            off[~there.valid] = np.nan
-        measured = _Measured(sight.t, same_turn(raw, sight.t, t, angles), off, sight.label, True)
-    vector = _Vector(
-        _ANGLES,
-        "deg",
-        angles,
-        plots.euler_sigma_deg(output.value, output.cov),
-        true,
-        error,
-        np.rad2deg(output.sigma),
-        measured,
-    )
-    caption = (
-        f"Rotation from {_frame(compared)} to the body by yaw (z), pitch (y) and roll (x). Errors are"
-        " rotation vectors in the body frame, estimate minus encoder."
-    )
-    return Figure("attitude", "Attitude", caption, _vector(compared, vector, bins))
-
-
-def _frame(compared: ComparedResult) -> str:
-    """Reference frame of attitudes and positions, in words."""
-    return "the reference frame" if compared.sight is None else compared.sight.frame
-
-
-def rate(compared: ComparedResult, bins: int) -> Figure | None:
-    """Angular rate, estimate and gyroscope."""
-    output = compared.result.outputs.get("rate")
-    if output is None:
-        return None
-    true = error = measured = None
-    recording, result = compared.recording, compared.result
-    if recording is not None and recording.encoder is not None:
-        true = np.rad2deg(encoder_rate_at(recording.encoder, result.time_ns))
-        error = np.rad2deg(output.value) - true
-    if recording is not None and recording.imu is not None:
-        imu = recording.imu
-        inside = (imu.time_ns >= result.time_ns[0]) & (imu.time_ns <= result.time_ns[-1])
-        times, gyroscope = imu.time_ns[inside], np.rad2deg(imu.gyroscope[inside])
-        off = None
-        if recording.encoder is not None:
-            off = gyroscope - np.rad2deg(encoder_rate_at(recording.encoder, times))
-        measured = _Measured(seconds(times, result), gyroscope, off, "gyroscope", False)
-    sigma = np.rad2deg(output.sigma)
-    vector = _Vector(
-        AXES, "deg/s", np.rad2deg(output.value), sigma, true, error, sigma, measured, noisy=True
-    )
-    caption = "Angular rate of the tool in the body frame; the gyroscope is shown as recorded."
-    return Figure("rate", "Angular rate", caption, _vector(compared, vector, bins))
-
-
-def position(compared: ComparedResult, bins: int) -> Figure | None:
-    """Position of the body's origin."""
-    output = compared.result.outputs.get("position")
-    if output is None:
-        return None
-    true = error = measured = None
-    recording, sight = compared.recording, compared.sight
-    known = None if recording is None else truth(compared.result, recording)
-    if known is not None and known.position is not None:
-        true = np.where(known.valid[:, None], 1e3 * known.position, np.nan)
-        error = 1e3 * output.value - true
-    if sight is not None and sight.pose.position is not None:
-        raw, off = 1e3 * sight.pose.position[sight.seen], None
-        if recording is not None and recording.encoder is not None and true is not None:
-            there = encoder_at(recording.encoder, sight.pose.time_ns[sight.seen])
-            if there.position is not None:
-                off = np.where(there.valid[:, None], raw - 1e3 * there.position, np.nan)
-        measured = _Measured(sight.t, raw, off, sight.label, True)
-    sigma = 1e3 * output.sigma
-    vector = _Vector(AXES, "mm", 1e3 * output.value, sigma, true, error, sigma, measured)
-    caption = f"Position of the body's origin in {_frame(compared)}."
-    return Figure("position", "Position", caption, _vector(compared, vector, bins))
-
-
-def velocity(compared: ComparedResult, bins: int) -> Figure | None:
-    """Velocity of the body's origin, which no sensor measures."""
-    output = compared.result.outputs.get("velocity")
-    if output is None:
-        return None
-    true = error = None
-    encoder = None if compared.recording is None else compared.recording.encoder
-    if encoder is not None and encoder.position is not None:
-        true = 1e3 * encoder_velocity_at(encoder, compared.result.time_ns)
-        error = 1e3 * output.value - true
-    sigma = 1e3 * output.sigma
-    vector = _Vector(AXES, "mm/s", 1e3 * output.value, sigma, true, error, sigma, None)
-    caption = f"Velocity of the body's origin in {_frame(compared)}."
-    return Figure("velocity", "Velocity", caption, _vector(compared, vector, bins))
+    title, caption, make = _QUANTITIES[name]
+    vector = make(compared.result, compared.recording, compared.sight)
+    frame = "the reference frame" if compared.sight is None else compared.sight.frame
+    return Figure(name, title, caption.format(frame), _vector(compared, vector, bins))
 
 
 def bias(compared: ComparedResult, bins: int) -> Figure | None:
@@ -252,7 +157,7 @@ def shade(grid: Grid, compared: ComparedResult) -> None:
     )
 
 
-def _vector(compared: ComparedResult, vector: _Vector, bins: int) -> dict[str, Any]:
+def _vector(compared: ComparedResult, vector: Vector, bins: int) -> dict[str, Any]:
     """A row for each component; on the right its error, if truth is known."""
     t, columns = compared.result.time, [_timed(compared)]
     if vector.error is not None:
@@ -266,8 +171,8 @@ def _vector(compared: ComparedResult, vector: _Vector, bins: int) -> dict[str, A
     return grid.document()
 
 
-def _value(grid: Grid, at: Place, t: Floats, vector: _Vector, i: int, label: str) -> None:
-    grid.axis(at, f"{label} ({vector.unit})", _limits(vector, i))
+def _value(grid: Grid, at: Place, t: Floats, vector: Vector, i: int, label: str) -> None:
+    grid.axis(at, f"{label} ({vector.unit})", curve_range(vector, i, 0.08))
     measured, unit = vector.measured, vector.unit
 
     def draw_truth() -> None:
@@ -287,7 +192,7 @@ def _value(grid: Grid, at: Place, t: Floats, vector: _Vector, i: int, label: str
         draw_truth()
 
 
-def _error(grid: Grid, at: Place, t: Floats, vector: _Vector, error: Floats, i: int) -> None:
+def _error(grid: Grid, at: Place, t: Floats, vector: Vector, error: Floats, i: int) -> None:
     unit, sigma, measured = vector.unit, vector.error_sigma[:, i], vector.measured
     shown = error
     off = None if measured is None or measured.error is None else measured.error[:, i]
@@ -304,24 +209,12 @@ def _error(grid: Grid, at: Place, t: Floats, vector: _Vector, error: Floats, i: 
         grid.line(at, t, side * sigma, name="edges of 2σ", **style)
 
 
-def _measurement(grid: Grid, at: Place, measured: _Measured, values: Floats, unit: str) -> None:
+def _measurement(grid: Grid, at: Place, measured: Measured, values: Floats, unit: str) -> None:
     name = measured.label
     if measured.dots:
         grid.dots(at, measured.t, values, name=name, colour=MEASURED, unit=unit)
     else:
         grid.line(at, measured.t, values, name=name, colour=MEASURED, unit=unit, width=0.8)
-
-
-def _limits(vector: _Vector, i: int) -> tuple[float, float]:
-    """Range of the curves, not widened by the band at the start or by outliers."""
-    values = vector.value[:, i]
-    if vector.measured is not None:
-        raw = vector.measured.value[:, i]
-        known = raw[np.isfinite(raw)]
-        values = np.r_[values, np.quantile(known, [0.005, 0.995])] if known.size else values
-    low, high = float(values.min()), float(values.max())
-    margin = 0.08 * (high - low) + 1e-9
-    return low - margin, high + margin
 
 
 def _symmetric(values: Floats) -> tuple[float, float] | None:

@@ -22,7 +22,9 @@ PALETTE = {
 """Each colour of the figures, and its replacement on a dark screen."""
 ESTIMATED = "estimate"
 SHADE = "rgba(128,128,128,0.24)"
-LINES = "rgba(128,128,128,0.28)"
+AXIS_LINES: dict[str, Any] = dict.fromkeys(
+    ("gridcolor", "zerolinecolor", "linecolor"), "rgba(128,128,128,0.28)"
+)
 _MOST_SHADES = 200
 _ROW_GAP = 0.045
 _TOP, _BOTTOM = 40, 44
@@ -63,20 +65,13 @@ class Grid:
         """Title and range (for `log` in powers of ten) of the vertical axis of a panel."""
         height = (1.0 - _ROW_GAP * (self._rows - 1)) / self._rows
         top = 1.0 - at.row * (height + _ROW_GAP)
-        axis = {
-            "anchor": self._x(at),
-            "domain": [round(max(top - height, 0.0), 5), round(top, 5)],
-            "title": {"text": title, "standoff": 6, "font": {"size": 11}},
-            "gridcolor": LINES,
-            "zerolinecolor": LINES,
-            "linecolor": LINES,
-            "nticks": 6,
-        }
+        axis: dict[str, Any] = axis_style(title) | {"nticks": 6}
+        axis |= {"anchor": self._x(at), "domain": panel_domain(top, height)}
         if limits is not None:
             axis["range"] = rounded_pair(limits)
         if log:
             axis |= {"type": "log", "dtick": 1, "exponentformat": "none"}
-        self._axes[self._named_axis(at)] = axis
+        self._axes[layout_name(self._y(at))] = axis
 
     def line(
         self,
@@ -137,73 +132,31 @@ class Grid:
 
     def level(self, at: Place, value: float, colour: str, dash: str = "solid") -> None:
         """A horizontal line across a panel."""
-        self._shapes.append(
-            {
-                "type": "line",
-                "xref": f"{self._x(at)} domain",
-                "yref": self._y(at),
-                "x0": 0,
-                "x1": 1,
-                "y0": value,
-                "y1": value,
-                "line": {"color": colour, "width": 1.2, "dash": dash},
-            }
-        )
+        line = {"color": colour, "width": 1.2, "dash": dash}
+        self._shapes.append(across(self._x(at), self._y(at), value, value) | {"line": line})
 
     def band(self, at: Place, low: float, high: float) -> None:
         """A horizontal band across a panel."""
-        self._shapes.append(
-            {
-                "type": "rect",
-                "xref": f"{self._x(at)} domain",
-                "yref": self._y(at),
-                "x0": 0,
-                "x1": 1,
-                "y0": low,
-                "y1": high,
-                "fillcolor": ESTIMATE,
-                "opacity": 0.16,
-                "line": {"width": 0},
-                "layer": "below",
-            }
-        )
+        fill = {"fillcolor": ESTIMATE, "opacity": 0.16, "line": {"width": 0}, "layer": "below"}
+        self._shapes.append(across(self._x(at), self._y(at), low, high) | fill)
 
     def shade(self, stretches: Sequence[tuple[float, float]], name: str) -> None:
         """Stretches of time in all panels; of very many the longest."""
         longest = sorted(sorted(stretches, key=lambda s: s[0] - s[1])[:_MOST_SHADES])
         for i, column in enumerate(self._columns):
             for begin, end in longest if column.timed else ():
-                self._shapes.append(
-                    {
-                        "type": "rect",
-                        "xref": self._x(Place(0, i)),
-                        "yref": "paper",
-                        "x0": round(begin, 3),
-                        "x1": round(end, 3),
-                        "y0": 0,
-                        "y1": 1,
-                        "fillcolor": SHADE,
-                        "line": {"width": 0},
-                        "layer": "below",
-                    }
-                )
+                place = {"xref": axis_name("x", i), "x0": round(begin, 3), "x1": round(end, 3)}
+                height = {"yref": "paper", "y0": 0, "y1": 1}
+                style = {"fillcolor": SHADE, "line": {"width": 0}, "layer": "below"}
+                self._shapes.append({"type": "rect"} | place | height | style)
         if longest:
             self.key(name, SHADE)
 
     def key(self, name: str, colour: str, *, opacity: float = 1.0) -> None:
         """An entry of the legend without a curve."""
         marker = {"symbol": "square", "size": 12, "color": colour, "opacity": opacity}
-        self._data.append(
-            {
-                "type": "scatter",
-                "x": [None],
-                "y": [None],
-                "mode": "markers",
-                "name": name,
-                "marker": marker,
-                "hoverinfo": "skip",
-            }
-        )
+        entry = {"type": "scatter", "x": [None], "y": [None], "mode": "markers", "marker": marker}
+        self._data.append(entry | {"name": name, "hoverinfo": "skip"})
 
     def document(self) -> dict[str, Any]:
         """Data and layout, for Plotly; `figures.js` adds bands and the domains of the columns."""
@@ -216,20 +169,16 @@ class Grid:
             **self._axes,
         }
         for i, column in enumerate(self._columns):
-            lowest = max((row for row in range(self._rows) if self._has(Place(row, i))), default=0)
-            axis: dict[str, Any] = {
-                "anchor": self._y(Place(lowest, i)),
+            panels = [self._y(Place(row, i)) for row in range(self._rows)]
+            drawn = [panel for panel in panels if layout_name(panel) in self._axes]
+            layout[layout_name(axis_name("x", i))] = AXIS_LINES | {
+                "anchor": drawn[-1] if drawn else panels[0],
                 "range": rounded_pair(column.range),
                 "title": {"text": column.title, "standoff": 6},
-                "gridcolor": LINES,
-                "zerolinecolor": LINES,
-                "linecolor": LINES,
                 "hoverformat": ".3f",
                 "unifiedhovertitle": {"text": "%{x} s"},
+                **({"matches": "x"} if i and column.timed else {}),
             }
-            if i and column.timed:
-                axis["matches"] = "x"
-            layout["xaxis" if i == 0 else f"xaxis{i + 1}"] = axis
         return {"data": self._data, "layout": layout}
 
     def _trace(
@@ -250,21 +199,32 @@ class Grid:
         self._named.add(name)
         self._data.append(trace)
 
-    def _has(self, at: Place) -> bool:
-        return self._named_axis(at) in self._axes
-
-    def _named_axis(self, at: Place) -> str:
-        return self._y(at).replace("y", "yaxis")
-
-    def _number(self, at: Place) -> int:
-        return at.row * len(self._columns) + at.column + 1
-
     def _x(self, at: Place) -> str:
-        return "x" if at.column == 0 else f"x{at.column + 1}"
+        return axis_name("x", at.column)
 
     def _y(self, at: Place) -> str:
-        number = self._number(at)
-        return "y" if number == 1 else f"y{number}"
+        return axis_name("y", at.row * len(self._columns) + at.column)
+
+
+def axis_name(kind: str, number: int) -> str:
+    """Plotly's name of an axis in a trace, by its number from zero."""
+    return kind if number == 0 else f"{kind}{number + 1}"
+
+
+def layout_name(axis: str) -> str:
+    """Plotly's name of the same axis in a layout."""
+    return f"{axis[0]}axis{axis[1:]}"
+
+
+def panel_domain(top: float, height: float) -> list[float]:
+    """Vertical extent of a panel, as shares of the figure."""
+    return [round(max(top - height, 0.0), 5), round(top, 5)]
+
+
+def across(x_axis: str, y_axis: str, low: float, high: float) -> dict[str, Any]:
+    """A shape over the whole width of a panel: a line, or a rectangle between two values."""
+    place = {"xref": f"{x_axis} domain", "yref": y_axis, "x0": 0, "x1": 1, "y0": low, "y1": high}
+    return place | {"type": "line" if low == high else "rect"}
 
 
 def common_layout(height: int, shares: Sequence[float] = (1.0,)) -> dict[str, Any]:
@@ -282,9 +242,8 @@ def common_layout(height: int, shares: Sequence[float] = (1.0,)) -> dict[str, An
 
 
 def axis_style(title: str) -> dict[str, Any]:
-    """Title and lines of an axis of a figure without `Grid`."""
-    lines = {"gridcolor": LINES, "zerolinecolor": LINES, "linecolor": LINES}
-    return {"title": {"text": title, "standoff": 6, "font": {"size": 11}}, **lines}
+    """Title and lines of an axis."""
+    return AXIS_LINES | {"title": {"text": title, "standoff": 6, "font": {"size": 11}}}
 
 
 def rounded_pair(limits: tuple[float, float]) -> list[float]:

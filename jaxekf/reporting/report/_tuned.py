@@ -1,32 +1,18 @@
 """A tuned folder of `jaxekf tune` read into memory: the record of the tuning, and comparisons in it."""
 
-import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.evaluation.spread import Spread, spread_of
 from jaxekf.io.documents import codec
 from jaxekf.io.documents.tuning import RunScore, TuningDocument
 
 FILE = "tuning.json"
 HELD = "hold last"
 _AGAIN = "tuning again with this version of jaxekf"
-BEST_AT_ONE = ("nis", "nees", "position_nees")
-
-
-class Spread(NamedTuple):
-    """A column of one variant over the runs; NaN where there are too few."""
-
-    mean: float
-    deviation: float
-    """Standard deviation of a run, by n - 1."""
-    worst: float
-    """The largest error; of NIS and NEES what is farthest from 1 as a factor."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +48,7 @@ def before_and_after(rows: Sequence[RunScore]) -> tuple[str, str]:
 def spread(rows: Sequence[RunScore], variant: str, column: str) -> Spread:
     """One column over the runs that have a number there."""
     each = [getattr(row, column) for row in rows if row.variant == variant]
-    values = np.array([value for value in each if value is not None], float)
-    if not values.size:
-        return Spread(math.nan, math.nan, math.nan)
-    with np.errstate(divide="ignore"):
-        badness = np.abs(np.log(values)) if column in BEST_AT_ONE else values
-    deviation = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-    return Spread(float(values.mean()), deviation, float(values[np.argmax(badness)]))
+    return spread_of([value for value in each if value is not None], column)
 
 
 def read_tuning(folder: Path | str) -> SavedTuning:

@@ -7,11 +7,20 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf.evaluation.spread import BEST_AT_ONE
 from jaxekf.io.documents.tuning import FreeNumber, RunScore, Step, TuningDocument
 from jaxekf.reporting.plots.style import ESTIMATE, MEASURED, REFUSED, TRUTH
 from jaxekf.reporting.report._figures import Figure
-from jaxekf.reporting.report._grid import THIRD, axis_style, common_layout
-from jaxekf.reporting.report._tuned import BEST_AT_ONE, HELD, before_and_after, variants
+from jaxekf.reporting.report._grid import (
+    THIRD,
+    across,
+    axis_name,
+    axis_style,
+    common_layout,
+    layout_name,
+    panel_domain,
+)
+from jaxekf.reporting.report._tuned import HELD, before_and_after, variants
 
 _TOP, _BOTTOM, _ROW, _GAP = 40, 44, 180, 34
 _MOST_NUMBERS = 60
@@ -60,7 +69,7 @@ def search(history: Sequence[Step], best: int, *, again: bool = False) -> Figure
     numbers = [step.number for step in history]
     data, layout, above = [], _panels(len(kinds)), 0
     for i, (kind, colour) in enumerate(zip(kinds, (ESTIMATE, MEASURED), strict=False)):
-        y_axis = _axis_of("y", i)
+        y_axis = axis_name("y", i)
         values = [None if step.rejected else getattr(step, kind) for step in history]
         style: dict[str, Any] = {"type": "scatter", "xaxis": "x", "yaxis": y_axis}
         line = {"color": colour, "width": 1.4}
@@ -69,33 +78,25 @@ def search(history: Sequence[Step], best: int, *, again: bool = False) -> Figure
             | {"x": numbers, "y": values, "name": kind, "mode": "lines+markers", "line": line}
             | {"marker": {"color": colour, "size": 5}, "hovertemplate": "%{y}"}
         )
-        at = [k for k, n in enumerate(numbers) if n == best and values[k] is not None]
-        if at:
+        points = style | {"mode": "markers", "showlegend": i == 0}
+        known = dict(zip(numbers, values, strict=True))
+        if known.get(best) is not None:
             marker = {"color": THIRD, "size": 13, "symbol": "star"}
-            point = {"x": [best], "y": [values[at[0]]], "name": f"best: iteration {best}"}
-            data.append(
-                style
-                | point
-                | {"mode": "markers", "marker": marker, "hoverinfo": "skip", "showlegend": i == 0}
-                | {"legendgroup": "best"}
-            )
+            point = {"x": [best], "y": [known[best]], "marker": marker, "hoverinfo": "skip"}
+            data.append(points | point | {"legendgroup": "best", "name": f"best: iteration {best}"})
         if rejected := _rejected(history, kind):
             marker = {"color": REFUSED, "size": 8, "symbol": "x"}
             where = {"x": [x for x, _ in rejected], "y": [y for _, y in rejected]}
-            data.append(
-                style
-                | where
-                | {"mode": "markers", "marker": marker, "name": "rejected", "showlegend": i == 0}
-                | {"legendgroup": "rejected", "hovertemplate": "not finite"}
-            )
+            where |= {"marker": marker, "hovertemplate": "not finite"}
+            data.append(points | where | {"legendgroup": "rejected", "name": "rejected"})
         limits, logarithmic, more = _limits([v for v in values if v is not None])
         above += more
-        axis = layout[_key("y", i)]
+        axis = layout[layout_name(axis_name("y", i))]
         axis |= axis_style(f"objective, {kind}") | {"range": limits, "nticks": 6}
         axis |= {"type": "log", "exponentformat": "power"} if logarithmic else {}
     last = max(numbers)
     layout["xaxis"] = axis_style("iteration") | {
-        "anchor": _axis_of("y", len(kinds) - 1),
+        "anchor": axis_name("y", len(kinds) - 1),
         "range": [-0.02 * max(last, 1) - 0.3, 1.02 * last + 0.3],
         "tick0": 0,
         "dtick": max(1, math.ceil(last / 12)),
@@ -152,14 +153,11 @@ def compared(name: str, title: str, rows: Sequence[RunScore]) -> Figure | None:
     layout = _panels(len(columns), wide)
     data: list[dict[str, Any]] = []
     for i, (column, head, unit) in enumerate(columns):
-        place = {"type": "scatter", "xaxis": _axis_of("x", i % wide), "yaxis": _axis_of("y", i)}
+        place = {"type": "scatter", "xaxis": axis_name("x", i % wide), "yaxis": axis_name("y", i)}
         values = {(row.run, row.variant): getattr(row, column) for row in rows}
         traces = _dots(rows, runs, values, unit)
-        data += [
-            place | {"showlegend": False} | t for t in traces if i == 0 or t["mode"] == "lines"
-        ]
-        data += [place | t | {"showlegend": False} for t in traces if i and t["mode"] != "lines"]
-        axis = layout[_key("y", i)]
+        data += [place | t | {"showlegend": i == 0 and t["showlegend"]} for t in traces]
+        axis = layout[layout_name(axis_name("y", i))]
         axis |= axis_style(f"{head} ({unit})" if unit else head)
         known = [v for t in traces for v in t["y"] if v is not None]
         axis |= _scale(known, about_one=column in BEST_AT_ONE)
@@ -168,8 +166,8 @@ def compared(name: str, title: str, rows: Sequence[RunScore]) -> Figure | None:
     step = math.ceil(len(runs) / _MOST_TICKS)
     for i in range(wide):
         lowest = max(k for k in range(len(columns)) if k % wide == i)
-        layout[_key("x", i)] = axis_style("") | {
-            "anchor": _axis_of("y", lowest),
+        layout[layout_name(axis_name("x", i))] = axis_style("") | {
+            "anchor": axis_name("y", lowest),
             "range": [-0.5, len(runs) - 0.5],
             "tickvals": list(range(0, len(runs), step)),
             "ticktext": [_safe(run) for run in runs[::step]],
@@ -199,13 +197,11 @@ def _dots(
         for variant in _drawn(rows, first, last)
     }
     found = [_links(by_variant[first], by_variant[last])] if first != last else []
-    others = 0
-    for variant, each in by_variant.items():
-        colour, symbol = _OTHERS[others % len(_OTHERS)], _SYMBOLS[others % len(_SYMBOLS)]
+    # The others come first in the order of drawing.
+    for i, (variant, each) in enumerate(by_variant.items()):
+        colour, symbol = _OTHERS[i % len(_OTHERS)], _SYMBOLS[i % len(_SYMBOLS)]
         if variant in (first, last):
             colour, symbol = ESTIMATE if variant == last else MEASURED, "circle"
-        else:
-            others += 1
         found.append(
             {
                 "x": list(range(len(runs))),
@@ -260,11 +256,10 @@ def _scale(values: Sequence[float], *, about_one: bool) -> dict[str, Any]:
 
 def _consistency_band(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
     """A line at one, and the band of consistency about it."""
-    across = {"xref": f"{x_axis} domain", "yref": y_axis, "x0": 0, "x1": 1, "layer": "below"}
-    line = {"type": "line", "y0": 1, "y1": 1, "line": {"color": TRUTH, "width": 1.2}}
-    fill = {"fillcolor": ESTIMATE, "opacity": 0.12, "line": {"width": 0}}
-    low, high = _CONSISTENT
-    return [across | {"type": "rect", "y0": low, "y1": high, **fill}, across | line]
+    fill = {"fillcolor": ESTIMATE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
+    line = {"line": {"color": TRUTH, "width": 1.2}, "layer": "below"}
+    band = across(x_axis, y_axis, *_CONSISTENT) | fill
+    return [band, across(x_axis, y_axis, 1, 1) | line]
 
 
 def intervals(numbers: Sequence[FreeNumber]) -> Figure | None:
@@ -334,19 +329,9 @@ def _panels(count: int, wide: int = 1) -> dict[str, Any]:
     layout["shapes"] = []
     for i in range(count):
         top = 1.0 - (i // wide) * (_ROW + _GAP) / inner
-        domain = [round(max(top - _ROW / inner, 0.0), 5), round(top, 5)]
-        layout[_key("y", i)] = {"anchor": _axis_of("x", i % wide), "domain": domain}
+        place = {"anchor": axis_name("x", i % wide), "domain": panel_domain(top, _ROW / inner)}
+        layout[layout_name(axis_name("y", i))] = place
     return layout
-
-
-def _axis_of(kind: str, number: int) -> str:
-    """Plotly's name of an axis in a trace."""
-    return kind if number == 0 else f"{kind}{number + 1}"
-
-
-def _key(kind: str, number: int) -> str:
-    """Plotly's name of the same axis in a layout."""
-    return _axis_of(kind, number).replace(kind, f"{kind}axis", 1)
 
 
 def _safe(name: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf.evaluation.spread import Spread
 from jaxekf.io.documents.tuning import FoldsDocument, RunScore, TuningDocument
 from jaxekf.reporting.report._figures import Figure
 from jaxekf.reporting.report._summary import shown
@@ -20,7 +21,6 @@ from jaxekf.reporting.report._tables import (
 )
 from jaxekf.reporting.report._tuned import (
     SavedTuning,
-    Spread,
     before_and_after,
     spread,
     variants,

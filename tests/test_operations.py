@@ -1,6 +1,7 @@
 """How large the programs are, and that no built-in model falls out of plain arithmetic."""
 
 import warnings
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +19,13 @@ from jaxekf.geometry.manifold import SO3
 
 RUNS, EPOCHS = 16, 32
 LIMITS = {"loose": 8_000, "tight": 15_000, "marg": 18_000, "visual": 25_000}
+WATCHFUL = 1.2
+"""Largest size of a program with gates and resets, relative to one without."""
 
 
 def problem(name, epochs):
-    """A model without gates at its defaults, and samples at every step; images at every fourth."""
-    model = robust(name, "none")
+    """A model without gates and resets, and samples at every step; images at every fourth."""
+    model = replace(robust(name, "none"), gate_reset_after_s=np.inf)
     substeps = 4 if name == "visual" else 1
     params = jax.tree.map(lambda a: jnp.asarray(a, float), model.parameters)
     x = model.initial_mean({})
@@ -69,9 +72,20 @@ def test_gradients_are_small_programs(name):
     """A change that takes derivatives through single numbers or a quaternion's four, or another copy
     of the step: minutes of compiling."""
     model, params, belief, steps = problem(name, EPOCHS)
-    text = lowered_gradient(model, params, belief, steps).as_text()
-    operations = sum(" = " in line for line in text.splitlines())
-    assert operations <= LIMITS[name]
+    assert count(lowered_gradient(model, params, belief, steps)) <= LIMITS[name]
+
+
+@pytest.mark.parametrize("method", ["gate", "none"])
+def test_resets_are_a_small_part_of_the_program(method):
+    """A reset of the belief that carries derivatives along, or is computed for each entry by itself."""
+    model, params, belief, steps = problem("loose", EPOCHS)
+    watchful = lowered_gradient(robust("loose", method), params, belief, steps)
+    assert count(watchful) <= WATCHFUL * count(lowered_gradient(model, params, belief, steps))
+
+
+def count(lowered):
+    """Number of operations of a program."""
+    return sum(" = " in line for line in lowered.as_text().splitlines())
 
 
 def test_only_what_is_free_is_differentiated():
@@ -87,8 +101,7 @@ def test_only_what_is_free_is_differentiated():
         return jnp.sum(output.instants.log_likelihood)
 
     def operations(function, at):
-        text = jax.jit(jax.grad(function)).lower(at).as_text()
-        return sum(" = " in line for line in text.splitlines())
+        return count(jax.jit(jax.grad(function)).lower(at))
 
     assert operations(value, params.noise) < 0.96 * operations(every, params)
 

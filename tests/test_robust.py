@@ -19,6 +19,9 @@ from jaxekf.filtering import ekf, smoother
 from jaxekf.filtering.model import Belief
 from jaxekf.filtering.steps import Rows, Steps
 from jaxekf.geometry import manifold, rotation
+from jaxekf.models.robust import OUTLIER_METHODS
+from jaxekf.recordings.truth import encoder_at
+from jaxekf.recordings.types import to_scipy
 from jaxekf.simulation import attitude_runs
 
 RUNS = 100
@@ -224,3 +227,74 @@ def test_old_names_work_for_one_release():
         assert dataclasses.replace(sensor, aux_like=1.0).typical_aux == 1.0
     with pytest.warns(DeprecationWarning, match="single_group"):
         assert sensor.alike is None
+
+
+WRONG = [
+    (5.0, 0.3),
+    (5.0, 3.0),
+    (20.0, 1.2),
+    (60.0, 0.6),
+    (180.0, 0.25),
+    (180.0, 1.2),
+    (120.0, 5.0),
+]
+"""Angle, degrees, and length, seconds, of stretches of wrong poses."""
+BEGIN_S, LENGTH_S = 8.0, 16.0
+
+
+def wrong_poses(seed, angle_deg, length_s, speed_deg=40.0):
+    """A run whose poses are turned about one body axis for a while."""
+    motion = attitude_runs.free_motion(seed, speed_deg=speed_deg)
+    run = attitude_runs.recording(f"w{seed}", motion, seed=seed, duration_s=LENGTH_S)
+    optical, axis = run.need_optical(), np.random.default_rng(seed).standard_normal(3)
+    time = (optical.time_ns - optical.time_ns[0]) / 1e9
+    wrong = (time >= BEGIN_S) & (time < BEGIN_S + length_s)
+    turn = scenario.Rotation.from_rotvec(np.deg2rad(angle_deg) * axis / np.linalg.norm(axis))
+    turned = scenario.from_scipy(to_scipy(optical.q_ref_body) * turn)
+    q = np.where(wrong[:, None], turned, optical.q_ref_body)
+    return run.replace(optical=dataclasses.replace(optical, q_ref_body=q))
+
+
+@pytest.mark.parametrize(
+    ("method", "smooth"),
+    scenario.long_form(
+        [(method, smooth) for method in OUTLIER_METHODS for smooth in (False, True)],
+        {(method, True) for method in ("huber", "student", "none")},
+    ),
+)
+def test_back_within_a_second_of_right_poses(method, smooth):
+    """Would catch a filter that stays with wrong poses, or whose bias or covariance they have spoilt."""
+    runs = [wrong_poses(seed, *stretch) for seed, stretch in enumerate(WRONG)]
+    model = jaxekf.robust("loose", method)
+    for run, made, stretch in zip(
+        runs, jaxekf.estimate_many(runs, model, smooth=smooth), WRONG, strict=True
+    ):
+        truth = to_scipy(encoder_at(run.need_encoder(), made.time_ns).q_ref_body)
+        error = (truth.inv() * to_scipy(made.attitude.value)).as_rotvec()
+        later = made.time > BEGIN_S + stretch[1] + 1.0
+        assert np.rad2deg(np.linalg.norm(error[later], axis=1)).max() < 1.0, stretch
+        assert np.sqrt(np.mean((error[later] / made.attitude.sigma[later]) ** 2)) < 3.0, stretch
+        assert np.isfinite(made.cov).all()
+        if stretch[1] > model.gate_reset_after_s and not smooth:
+            assert any("contradicted the estimate" in note for note in made.notes), stretch
+
+
+def test_a_bias_survives_wrong_poses_behind_a_gate():
+    """Would catch a reset that forgets the bias, which the gyroscope's own samples never contradicted."""
+    run = wrong_poses(3, 90.0, 1.0)
+    made = jaxekf.estimate(run, jaxekf.robust("loose", "gate"))
+    clean = jaxekf.estimate(wrong_poses(3, 0.0, 1.0), jaxekf.robust("loose", "gate"))
+    last = made.time > BEGIN_S + 3.0
+    apart = np.abs(made.bias.value - clean.bias.value)[last]
+    assert (apart < 3.0 * made.bias.sigma[last]).all()
+    assert made.bias.sigma[-1].max() < 2.0 * clean.bias.sigma[-1].max()
+
+
+def test_sensors_that_observe_other_states_do_not_confirm_each_other():
+    """Would catch a gyroscope, accepted at every sample, that keeps a lost attitude from being reset."""
+    run = wrong_poses(4, 60.0, 3.0, speed_deg=4.0)
+    made = jaxekf.estimate(run, jaxekf.robust("loose_rate", "gate"))
+    assert any("contradicted the estimate" in note for note in made.notes)
+    truth = to_scipy(encoder_at(run.need_encoder(), made.time_ns).q_ref_body)
+    error = (truth.inv() * to_scipy(made.attitude.value)).magnitude()
+    assert np.rad2deg(error[made.time > BEGIN_S + 4.0].max()) < 1.0

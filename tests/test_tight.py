@@ -200,7 +200,7 @@ def test_a_lost_filter_recovers():
     made = jaxekf.estimate(moved, "tight", matched())
     late = errors(made, one)[-100:, :3] + [0.3, -0.2, 0.1]
     assert np.abs(late).max() < 5e-3
-    assert "the covariance was inflated" in made.notes[0]
+    assert "the covariance was increased" in made.notes[0]
     held = made.time < 2.7 + tight.MODEL.gate_reset_after_s
     assert np.abs(errors(made, one)[held, :3]).max() < 0.3
 

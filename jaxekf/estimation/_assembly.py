@@ -81,10 +81,9 @@ def as_estimate(
     if output.instants.recovered is not None and (opened := flat(output.instants.recovered)).any():
         at = (line.time_ns[valid][opened] - line.time_ns[valid][0]) / NANOSECONDS
         notes += (
-            f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} the gates"
-            f" had rejected all samples for {model.gate_reset_after_s} s and the covariance was"
-            f" inflated, {len(at)} times; if these samples are good, the noise is too small for this"
-            " gate: tune it, or use robust weighting (robust: huber)",
+            f"at {', '.join(f'{t:.3f}' for t in at[:5])} s{' and later' if len(at) > 5 else ''} all samples"
+            f" had contradicted the estimate for {model.gate_reset_after_s} s and the covariance was"
+            f" increased, {len(at)} times: look for wrong poses before, or for noise that is too small",
         )
     if smooth:
         notes += ("smoothed: each instant is estimated from the whole run",)

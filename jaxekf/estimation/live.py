@@ -140,7 +140,7 @@ class Stream:
         self.dropped: dict[str, int] = {sensor.name: 0 for sensor in model.sensors}
         self._horizon_ns, self._capacity = round(horizon_s * NANOSECONDS), capacity
         self._belief = jax.tree.map(jnp.asarray, belief)
-        self._rejecting_s = jnp.zeros(())
+        self._rejecting_s: Any = None
         self._base_ns, self._base_is_open = int(start_ns), True
         self._start_ns = int(start_ns)
         self._times: list[int] = []
@@ -258,6 +258,9 @@ class Stream:
     def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
         """Filter over these instants, make the first `final` of them final, and return the last belief."""
         steps = self._steps(instants)
+        if self._rejecting_s is None:
+            groups = ekf.count_reset_groups(self.model, self.params, self._belief, steps)
+            self._rejecting_s = jnp.zeros(groups)
         output, outputs = _advance(self.model, self.params, self._belief, self._rejecting_s, steps)
         count = len(instants)
         if not np.asarray(output.instants.healthy)[:count].all():
@@ -340,7 +343,6 @@ def _advance(
 ) -> tuple[ekf.FilterOutput, Mapping[str, Any]]:
     """Filter one window, and evaluate the model's outputs at its instants."""
     one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, rejecting_s))
-    gated = any(sensor.gate is not None for sensor in model.sensors)
-    output = ekf.run_filter_batch(model, *one[:3], rejecting_s=one[3] if gated else None)
+    output = ekf.run_filter_batch(model, *one[:3], rejecting_s=one[3])
     outputs = evaluate_outputs(model, one[0], output)
     return jax.tree.map(lambda a: a[0], (output, outputs))

@@ -52,7 +52,7 @@ class Resets(NamedTuple):
     recovered: dict[str, Array]
     """By sensor: (lanes,) where its group is reset."""
     added_cov: Array
-    """(n, n, lanes) process noise of the resets; zero where there is none."""
+    """(n, n, lanes) process noise of the resets, without derivatives; zero where there is none."""
 
     @property
     def anywhere(self) -> Array:
@@ -107,9 +107,10 @@ def reset(
     initial_variance
         (n, lanes) variances at the start of a run.
     """
-    variance = jnp.stack([prior_cov[i, i] for i in range(prior_cov.shape[0])])
     counters, recovered = [], {}
     added = jnp.zeros_like(prior_cov)
+    # Without derivatives: the noise follows the innovation, hardly the covariance.
+    prior_cov, initial = lax.stop_gradient(prior_cov), initial_variance[:, None]
     for counter, group in zip(rejecting_s, groups, strict=True):
         sampled = [tallies[name] for name in group.sensors if name in tallies]
         if not sampled:
@@ -128,15 +129,16 @@ def reset(
         cleared = here | tally.accepted
         counters.append(jnp.where(cleared, 0.0, counter + tally.rejected_s))
         recovered |= {name: here for name in group.sensors if name in tallies}
-        opened = jnp.where(here, tally.excess - 1.0, 0.0)
+        # Gates have kept wrong samples from moving the other states; without, all have moved them.
+        allowed = _GROWTH * prior_cov
         if group.is_gated:
-            grown = jnp.minimum(_GROWTH * variance, initial_variance)
+            allowed = jnp.minimum(allowed, initial)
         else:
-            grown = tally.excess * variance
-        allowed = jnp.where(here, grown, 0.0)
+            allowed = allowed * tally.excess[None, None]
         inside = np.array(group.observed)
-        both = jnp.asarray(np.outer(inside, inside), prior_cov.dtype)[..., None]
-        outside = jnp.asarray(np.diag(~inside), prior_cov.dtype)[..., None]
-        added = added + prior_cov * (both * lax.stop_gradient(opened))
-        added = added + outside * lax.stop_gradient(allowed)[None]
+        both = np.outer(inside, inside)[..., None]
+        opened = jnp.where(both, prior_cov * (tally.excess - 1.0)[None, None], 0.0)
+        outside = np.diag(~inside)[..., None]
+        noise = jnp.where(outside, allowed, opened)
+        added = added + jnp.where(here[None, None], noise, 0.0)
     return Resets(jnp.stack(counters), recovered, added)

@@ -28,7 +28,7 @@ _HUBER_PROBABILITY = 0.95
 """Probability with which a Gaussian group keeps its full weight under Huber's law."""
 _STUDENT_DOF = 4.0
 """Degrees of freedom of Student's t: heavy tails, finite variance."""
-_PLAUSIBLE = 0.999
+_PLAUSIBLE = 0.99
 """Without a gate: probability with which a Gaussian group agrees with the belief (see `_belief_reset`)."""
 _REOPENED_RATIO = 7.0
 """After a gate reset, groups of a repeated sensor are accepted up to this multiple of the mean normalised
@@ -82,7 +82,7 @@ def gate_and_weight(
     prior_cov: Array,
     rejecting_s: Array | None,
 ) -> GatingResult:
-    """Reject rows by gates, inflate the noise of others by weights, and reset a belief that none agrees with.
+    """Reject rows by gates, inflate the noise of others by weights, reset a belief that no sample agrees with.
 
     At a reset (`jaxekf.filtering._belief_reset`) gates are open and all samples have full weight.
 
@@ -109,7 +109,12 @@ def gate_and_weight(
         sensor = sensors[name]
         if rejecting_s is None and sensor.gate is None and sensor.weighting is None:
             continue
-        distances[name] = _innovation_distances(sensor, one, prior_cov)
+        seen = one, prior_cov
+        if sensor.weighting is None:
+            # Gates and resets have no derivative.
+            seen = lax.stop_gradient((one.rows, prior_cov))
+            seen = one._replace(rows=seen[0]), seen[1]
+        distances[name] = _innovation_distances(sensor, *seen)
         outside, ratios[name], tallies[name] = _compare_with_bounds(
             sensor, one.rows.mask, distances[name], samples[name].dt
         )

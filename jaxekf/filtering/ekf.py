@@ -79,10 +79,11 @@ class Instant(NamedTuple):
     healthy: Array
     """False where a covariance is not finite or not definite."""
     recovered: Array | None
-    """True where the gates were reset and the belief was widened (see `Model.gate_reset_after_s`); None
-    without gates, or if not kept."""
+    """True where the belief was reset because all samples contradicted it (see `Model.gate_reset_after_s`);
+    None if the model is never reset, or if not kept."""
     rejecting_s: Array | None
-    """Seconds of samples that gates have rejected since they last accepted one; None likewise."""
+    """(K, S, groups) seconds of samples outside their chi-square bounds since the last one inside, for each
+    group of sensors that observe common states; None likewise."""
 
     @property
     def refused(self) -> Array | None:
@@ -291,6 +292,12 @@ def run_filter_batch(
     )
     innovations = _innovations(model, params, u, steps, kept) if save.used else {}
     return FilterOutput(instants, u, innovations)
+
+
+def count_reset_groups(model: Model, params: Parameters, belief: Belief, steps: Steps) -> int:
+    """Number of groups in `Instant.rejecting_s`, for the arguments of `run_filter`."""
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
+    return len(lower_model(model, *one)[0].reset_groups)
 
 
 def lower_model(

@@ -367,7 +367,7 @@ class Model:
     object for the same result."""
     setup: Callable[[Recording], Any] | None = None
     """``setup(recording)``: `Parameters.setup`; None for a model without."""
-    gate_reset_after_s: float = 0.4
+    gate_reset_after_s: float = 0.35
     """Seconds of samples of a sensor outside their chi-square bound, none inside, after which the belief is
     reset (gates open, covariance grows); infinite for never."""
     input: Input | None = None

@@ -25,10 +25,10 @@ def robust(model: str | Model, outlier_method: OutlierMethod, probability: float
     model
         The model or its name.
     outlier_method
-        ``gate`` rejects samples outside a chi-square bound; where gates have rejected everything for
-        `Model.gate_reset_after_s`, the belief is widened and they open once. ``huber`` and ``student``
-        reject nothing but give samples less weight the larger their innovation is, so that none moves the
-        estimate far. ``none`` gives every sample full weight.
+        ``gate`` rejects samples outside a chi-square bound. ``huber`` and ``student`` reject nothing but
+        give samples less weight the larger their innovation is, so that none moves the estimate far.
+        ``none`` gives every sample full weight. With each of them the belief is reset if all samples
+        contradict it for `Model.gate_reset_after_s`.
     probability
         Probability with which a Gaussian sample passes the gate.
 

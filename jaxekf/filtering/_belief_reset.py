@@ -130,14 +130,11 @@ def reset(
         counters.append(jnp.where(cleared, 0.0, counter + tally.rejected_s))
         recovered |= {name: here for name in group.sensors if name in tallies}
         # Gates have kept wrong samples from moving the other states; without, all have moved them.
-        allowed = _GROWTH * prior_cov
-        if group.is_gated:
-            allowed = jnp.minimum(allowed, initial)
-        else:
-            allowed = allowed * tally.excess[None, None]
+        grown, excess = _GROWTH * prior_cov, tally.excess[None, None]
+        allowed = jnp.minimum(grown, initial) if group.is_gated else grown * excess
         inside = np.array(group.observed)
         both = np.outer(inside, inside)[..., None]
-        opened = jnp.where(both, prior_cov * (tally.excess - 1.0)[None, None], 0.0)
+        opened = jnp.where(both, prior_cov * (excess - 1.0), 0.0)
         outside = np.diag(~inside)[..., None]
         noise = jnp.where(outside, allowed, opened)
         added = added + jnp.where(here[None, None], noise, 0.0)

@@ -82,7 +82,7 @@ def gate_and_weight(
     prior_cov: Array,
     rejecting_s: Array | None,
 ) -> GatingResult:
-    """Reject rows by gates, inflate the noise of others by weights, reset a belief that no sample agrees with.
+    """Reject rows by gates, inflate the noise of others by weights, reset a belief that all contradict.
 
     At a reset (`jaxekf.filtering._belief_reset`) gates are open and all samples have full weight.
 

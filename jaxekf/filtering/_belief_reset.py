@@ -20,6 +20,9 @@ _GROWTH = 99.0
 """Variance that a reset adds to states that the sensors do not observe, as a multiple of theirs, if the
 gates have kept wrong samples from moving them: ten times the deviation."""
 
+_FEWEST = 6
+"""Samples in a row before a reset, at least, from a slow sensor."""
+
 
 class ResetGroup(NamedTuple):
     """Sensors that observe common states, and so confirm or contradict the same part of the belief."""
@@ -124,8 +127,9 @@ def reset(
                 jnp.maximum(tally.rejected_s, other.rejected_s),
                 jnp.maximum(tally.excess, other.excess),
             )
-        # Earlier samples must have filled the time: a single one is outside whatever its period.
-        here = tally.rejected & ~tally.accepted & (counter > after_s)
+        # Earlier samples must have filled the time: a few are outside by chance, whatever their period.
+        enough = counter > jnp.maximum(after_s, _FEWEST * tally.rejected_s)
+        here = tally.rejected & ~tally.accepted & enough
         cleared = here | tally.accepted
         counters.append(jnp.where(cleared, 0.0, counter + tally.rejected_s))
         recovered |= {name: here for name in group.sensors if name in tallies}

@@ -104,7 +104,8 @@ def mean_nees(error: Floats, cov: Floats) -> float:
 def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
     """Errors (N, 3) of the outputs attitude, rate, position and velocity against the encoder.
 
-    Attitude errors are rotation vectors in the body frame, all in SI units. Instants whose nearest encoder
+    The encoder is compared on the IMU's clock, its stamps less its `latency`. Attitude errors are rotation
+    vectors in the body frame, all in SI units. Instants whose nearest encoder
     sample is not scored or not known are NaN.
 
     Raises
@@ -113,16 +114,17 @@ def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats
         If the run has no encoder.
     """
     encoder, outputs = recording.need_encoder(), estimate.outputs
-    truth = encoder_at(encoder, estimate.time_ns)
+    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    truth = encoder_at(encoder, time_ns)
     errors: dict[str, Floats] = {}
     if "attitude" in outputs:
         errors["attitude"] = attitude_error(outputs["attitude"].value, truth.q_ref_body)
     if "rate" in outputs:
-        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, estimate.time_ns)
+        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, time_ns)
     if "position" in outputs and truth.position is not None:
         errors["position"] = outputs["position"].value - truth.position
     if "velocity" in outputs and truth.position is not None:
-        velocity = encoder_velocity_at(encoder, estimate.time_ns)
+        velocity = encoder_velocity_at(encoder, time_ns)
         errors["velocity"] = outputs["velocity"].value - velocity
     return {name: np.where(truth.scored[:, None], e, np.nan) for name, e in errors.items()}
 
@@ -132,7 +134,8 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
 
     Errors count at instants of the estimate whose nearest encoder sample is scored, from `burn_in_s`
     on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
-    body's origin in the reference frame.
+    body's origin in the reference frame. The encoder's stamps, less its `latency`, are taken for those of
+    the IMU's clock.
 
     Parameters
     ----------
@@ -162,7 +165,8 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
-    judged = encoder_at(recording.need_encoder(), estimate.time_ns).scored
+    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    judged = encoder_at(recording.need_encoder(), time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)
     errors = scored_errors(estimate, recording)
 

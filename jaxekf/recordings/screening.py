@@ -149,6 +149,7 @@ def encoder(
     scored: Flags | None = None,
     hidden: Flags | None = None,
     sort: bool = False,
+    latency_ns: int = 0,
 ) -> tuple[Encoder, Intake]:
     """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked, as are
     rows that `hidden` (N,) names.
@@ -169,7 +170,8 @@ def encoder(
     need_usable(place, valid, account, "row", hint)
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
-    return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
+    scored = scored[order] & valid
+    return Encoder(time_ns, unit, valid, scored, position, latency_ns), account
 
 
 def judge_markers(

@@ -212,3 +212,38 @@ def test_both_ways():
     times = np.array([7_000_000_000, 7_000_000_001, 900_000_000_003], np.int64)
     back = clock.tracker_from_imu(clock.imu_from_tracker(times))
     assert np.abs(back - times).max() <= 1
+
+
+def late_encoder(run, late_s):
+    encoder = run.need_encoder()
+    return run.replace(encoder=replace(encoder, time_ns=encoder.time_ns + ns(late_s)))
+
+
+def test_a_late_encoder_is_named(estimates):
+    """A score of a wrong clock without a word; the shift's sign, size or deviation wrong."""
+    _, runs, made = estimates
+    off = []
+    for run, one in zip(runs[:10], made[:10], strict=True):
+        assert jaxekf.score(one, run, burn_in_s=2.0).sentences() == ()
+        found = jaxekf.score(one, late_encoder(run, 0.112), burn_in_s=2.0)
+        off.append((found.time_shift_s - 0.112) / found.time_shift_sigma_s)
+        (text,) = found.sentences()
+        assert "later" in text and "time_shift = -0.11" in text
+        assert "align" not in text and found.shifted_rmse_deg < 0.1
+    assert np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_a_tracker_that_disagrees_is_not_the_encoder():
+    """The encoder blamed for a tracker whose clock is not the IMU's, although the rate agrees."""
+    runs = [planted(seed, 0.06) for seed in range(4)]
+    texts = []
+    for run, one in zip(runs, jaxekf.estimate_many(runs, "loose", tight_tracker()), strict=True):
+        texts += jaxekf.score(one, run, burn_in_s=2.0).sentences()
+    assert texts and all("jaxekf align" in text and "time_shift" not in text for text in texts)
+
+
+def tight_tracker():
+    """Parameters of `loose` with a tracker that outweighs the gyroscope."""
+    params = parameters()
+    noise = params.noise._replace(gyroscope=np.deg2rad(20.0), optical=np.deg2rad(0.2))
+    return params._replace(noise=noise)

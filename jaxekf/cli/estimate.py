@@ -228,7 +228,8 @@ def estimate(
             made = next(pending)
             diagnosis = diagnose(made, recording)
             truth = recording.encoder is not None
-            score = metrics.score(made, recording).as_dict() if truth else None
+            found = metrics.score(made, recording) if truth else None
+            score = None if found is None else found.as_dict()
             folder = made.save(
                 output / recording.name,
                 overwrite=overwrite,
@@ -239,6 +240,8 @@ def estimate(
             summaries.append(describe(made, recording, diagnosis, score) | {"result": str(folder)})
         estimates.append(made)
         warn(made, diagnosis)
+        for text in () if found is None else found.sentences():
+            note(f"{made.run}: {text}")
         wrote(folder)
     document = {"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries}
     if len(recordings) > 1:

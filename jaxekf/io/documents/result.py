@@ -53,6 +53,11 @@ class ScoreNumbers(Struct):
     position_rmse_mm: float | None
     position_nees: float | None
     samples: int
+    time_shift_s: float | None = None
+    time_shift_sigma_s: float | None = None
+    shifted_rmse_deg: float | None = None
+    rate_shift_s: float | None = None
+    rate_shift_sigma_s: float | None = None
 
 
 class SquaresTest(Struct):

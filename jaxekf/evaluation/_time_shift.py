@@ -18,7 +18,7 @@ _GRID_S = 0.02
 _FAR_RAD = 0.02
 """Error, rad, from which on the shift may be too long to be found from zero."""
 _LEAST_RATE = 0.05
-"""Root mean square, rad/s or rad/s^2, of a motion that tells a shift from a constant error."""
+"""Root mean square, rad/s or rad/s^2, of a motion that differs from a constant error."""
 _SLOPE_NS = 5_000_000
 _SMALL_S = 5e-4
 """A step of Gauss-Newton below which the next one changes nothing that counts."""
@@ -29,7 +29,7 @@ Residual = Callable[[float], tuple[Floats, Floats]]
 
 
 class TimeShift(NamedTuple):
-    """A shift, s, to be added to the estimate's times; NaN where the motion does not tell it."""
+    """A shift, s, to be added to the estimate's times; NaN where the motion does not show it."""
 
     shift_s: float
     sigma_s: float
@@ -41,6 +41,7 @@ UNKNOWN = TimeShift(float("nan"), float("nan"))
 def attitude_shift(encoder: Encoder, time_ns: Times, q: Floats) -> TimeShift:
     """Shift of attitudes (N, 4) at times (N,) of the encoder's clock, constant rotations apart."""
     time_ns, q = _thinned(time_ns, q)
+
     def residual(shift_s: float) -> tuple[Floats, Floats]:
         at = time_ns + round(shift_s * NANOSECONDS)
         truth, rate = encoder_at(encoder, at), encoder_rate_at(encoder, at)

@@ -74,8 +74,8 @@ class Score(NamedTuple):
         same = abs(self.rate_shift_s - shift) < 0.2 * abs(shift) + 3.0 * self.rate_shift_sigma_s
         none = abs(self.rate_shift_s) < 0.2 * abs(shift) + 3.0 * self.rate_shift_sigma_s
         encoder = (
-            f"the encoder's clock is not that of the IMU: state time_shift = {-shift:.4f} under [encoder],"
-            " unless it has one"
+            "the stamps of encoder and IMU disagree: state in recording.toml"
+            f" time_shift = {-shift:.4f} under [encoder], or {shift:.4f} under [imu] if those are off"
         )
         tracker = "tracker and IMU disagree: run jaxekf align and use its calibration.toml"
         if certain and same:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxekf.recordings import sensor_rates
 from jaxekf.recordings.accounts import Indices, Intake, Place, Reason
 from jaxekf.recordings.quaternion_norms import judge_quaternions, whole
 from jaxekf.recordings.types import Encoder, Flags, Floats, Imu, Optical, Times
@@ -112,34 +113,37 @@ def imu(
     """An IMU's samples, SI units; rows of which gyroscope or accelerometer is not finite are masked: they
     are left out of the stream, for an input cannot be masked.
 
-    A magnetometer may be slower than the rest: where it is not finite it was not read. Raises
-    `RecordingError` where no row is finite, and what `in_order` and `check_rate` raise.
+    A magnetometer may be slower than the rest: where it is not finite it was not read. An accelerometer
+    at a rate of its own, blank between its samples or in rows of its own, is brought to the gyroscope's
+    samples by `sensor_rates.at_gyroscope`. Raises `RecordingError` where no row is finite, and what
+    `in_order` and `check_rate` raise.
     """
     numbers = [a for a in (gyroscope, accelerometer, magnetometer) if a is not None]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
-    bad, far = np.zeros(len(order), bool), np.zeros(len(order), bool)
-    for needed in (gyroscope, accelerometer):
-        if needed is not None:
-            bad |= ~whole(chosen(needed, order))
-            far |= huge(chosen(needed, order))
+    gyroscope = chosen(gyroscope, order)
+    others = (None if a is None else chosen(a, order) for a in (accelerometer, magnetometer))
+    joined = sensor_rates.at_gyroscope(time_ns, gyroscope, *others)
+    bad, far = ~whole(gyroscope), huge(gyroscope)
+    if joined.accelerometer is not None:
+        bad |= ~whole(joined.accelerometer)
+        far |= huge(joined.accelerometer)
+    reasons = {"of another sensor, without gyroscope": joined.alone}
     valid, account = mask_first(
-        place, time_ns, account, {"not finite": bad, "beyond any sensor": far}
+        place, time_ns, account, reasons | {"not finite": bad, "beyond any sensor": far}
     )
     if not valid.any():
         raise place.error(
             None, None, f"no finite row among {account.rows}", "at least one", "recording again"
         )
-    streams = [
-        None if a is None else chosen(a, order[valid])
-        for a in (gyroscope, accelerometer, magnetometer)
-    ]
-    gyro, *others = streams
-    assert gyro is not None
     assert account.numbers is not None
-    account = replace(account, numbers=account.numbers[valid])
-    return Imu(time_ns[valid], gyro, *others), account
+    notes = (*account.notes, *joined.notes)
+    account = replace(account, numbers=account.numbers[valid], notes=notes)
+    kept = np.flatnonzero(valid)
+    others = (joined.accelerometer, joined.magnetometer)
+    streams = (None if a is None else chosen(a, kept) for a in others)
+    return Imu(time_ns[valid], chosen(gyroscope, kept), *streams), account
 
 
 def encoder(

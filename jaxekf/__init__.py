@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jaxekf.estimation import timeline
     from jaxekf.estimation.batch import estimate, estimate_many
     from jaxekf.estimation.causal import estimate_online
+    from jaxekf.estimation.clock import Clock
     from jaxekf.estimation.live import Known, Stream
     from jaxekf.estimation.output_times import Every, every
     from jaxekf.estimation.parameters import load as load_parameters
@@ -62,6 +63,7 @@ __all__ = [
     "Belief",
     "CacheError",
     "Camera",
+    "Clock",
     "Consistency",
     "Diagnosis",
     "Encoder",

@@ -116,7 +116,8 @@ def align_run(recording: Recording) -> RunAlignment:
     if recording.encoder is not None and not joint:
         stream = recording.encoder
         try:
-            encoder = align(Optical(stream.time_ns, stream.q_ref_body, stream.valid), imu, place)
+            taken = stream.time_ns - stream.latency_ns
+            encoder = align(Optical(taken, stream.q_ref_body, stream.valid), imu, place)
         except RecordingError as error:
             notes.append(f"the encoder's alignment could not be estimated: {error}")
     return RunAlignment(recording.name, tracker, encoder, tuple(notes))

@@ -25,6 +25,7 @@ from jaxekf.cli.console import (
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import estimate_many
 from jaxekf.estimation.causal import estimate_online
+from jaxekf.estimation.clock import ClockName
 from jaxekf.estimation.output_times import Every, OutputTimes, every, read_output_times
 from jaxekf.estimation.result import Estimate, trackers
 from jaxekf.evaluation import metrics
@@ -156,7 +157,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     "times_files",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="CSV file with additional output times in the column time, s on the recording's clock. The"
+    help="CSV file with additional output times in the column time, s on the clock of the results. The"
     " estimates at these times are in requested.csv and in the exports. One file for all runs, or repeated"
     " for each.",
 )
@@ -166,6 +167,14 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     type=click.FloatRange(min=1e-9, max=1e9),
     metavar="SECONDS",
     help="Period of additional output times, s, from the first instant of each run on; see --at.",
+)
+@click.option(
+    "--clock",
+    type=click.Choice(("imu", "tracker")),
+    default="imu",
+    show_default=True,
+    help="Clock of all times of the results and of --at: that of the IMU, by the clock offset (or latency)"
+    " and drift of the parameters, or that of the tracker's samples, without them.",
 )
 @overwrite_option
 @json_option
@@ -181,6 +190,7 @@ def estimate(
     exports: tuple[str, ...],
     times_files: tuple[Path, ...],
     period: float | None,
+    clock: ClockName,
     overwrite: bool,
     as_json: bool,
 ) -> None:
@@ -204,9 +214,13 @@ def estimate(
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
     if online:
-        pending = (estimate_online(recording, chosen, params) for recording in recordings)
+        pending = (
+            estimate_online(recording, chosen, params, clock=clock) for recording in recordings
+        )
     else:
-        pending = iter(estimate_many(recordings, chosen, params, smooth=smooth, at=requested))
+        pending = iter(
+            estimate_many(recordings, chosen, params, smooth=smooth, at=requested, clock=clock)
+        )
     estimates, summaries = [], []
     # Each result is written before the next estimate, so that it is kept if the command is interrupted.
     for recording in recordings:
@@ -214,7 +228,8 @@ def estimate(
             made = next(pending)
             diagnosis = diagnose(made, recording)
             truth = recording.encoder is not None
-            score = metrics.score(made, recording).as_dict() if truth else None
+            found = metrics.score(made, recording) if truth else None
+            score = None if found is None else found.as_dict()
             folder = made.save(
                 output / recording.name,
                 overwrite=overwrite,
@@ -225,6 +240,8 @@ def estimate(
             summaries.append(describe(made, recording, diagnosis, score) | {"result": str(folder)})
         estimates.append(made)
         warn(made, diagnosis)
+        for text in () if found is None else found.sentences():
+            note(f"{made.run}: {text}")
         wrote(folder)
     document = {"model": chosen.name, "online": online, "smoothed": smooth, "runs": summaries}
     if len(recordings) > 1:

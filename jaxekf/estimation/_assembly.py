@@ -1,6 +1,7 @@
 """Arrays of the filter made into an `Estimate`: samples, account, notes and outputs of one run."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -109,9 +110,27 @@ def as_estimate(
             "intake": {label: read.as_dict() for label, read in recording.intake.items()},
         },
     )
-    if line.requested_ns is None or line.measured_ns is None:
-        return estimated
-    return estimated.split(np.isin(estimated.time_ns, line.measured_ns), line.requested_ns)
+    if line.requested_ns is not None and line.measured_ns is not None:
+        measured = np.isin(estimated.time_ns, line.measured_ns)
+        estimated = estimated.split(measured, line.requested_ns)
+    return on_clock(estimated, line)
+
+
+def on_clock(made: Estimate, line: Timeline) -> Estimate:
+    """An estimate at instants of a timeline, with its times on the timeline's `Timeline.clock`."""
+    sensors = {
+        name: replace(record, time_ns=line.on_clock(record.time_ns))
+        for name, record in made.sensors.items()
+    }
+    start = None if made.start_ns is None else int(line.on_clock(np.array([made.start_ns]))[0])
+    return replace(
+        made,
+        time_ns=line.on_clock(made.time_ns),
+        sensors=sensors,
+        start_ns=start,
+        clock=line.clock,
+        requested=None if made.requested is None else on_clock(made.requested, line),
+    )
 
 
 def named_outputs(model: Model, outputs: Mapping[str, Any]) -> dict[str, OutputEstimate]:

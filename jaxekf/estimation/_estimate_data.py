@@ -7,6 +7,7 @@ from typing import Any, Protocol, Self
 import jax
 import numpy as np
 
+from jaxekf.estimation.clock import Clock
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.geometry import manifold
 from jaxekf.recordings.types import NANOSECONDS, Floats, Times
@@ -70,6 +71,9 @@ class Estimated(Protocol):
     @property
     def outputs(self) -> dict[str, OutputEstimate]: ...
 
+    @property
+    def clock(self) -> Clock: ...
+
 
 @dataclass(frozen=True)
 class SensorRecord:
@@ -91,7 +95,7 @@ class SensorRecord:
     """
 
     time_ns: Times
-    """(N,) int64 nanoseconds at which the samples were taken."""
+    """(N,) int64 nanoseconds at which the samples were taken, on `Estimate.clock`."""
     residual: Floats
     """(N, rows) innovation; 0 where a row was not used."""
     cov: Floats
@@ -138,6 +142,9 @@ class EstimateData:
     """Whether its instants are requested times: it can be exported, but not diagnosed or saved."""
     start_ns: int | None = None
     """Zero of `time`; None for the first instant."""
+    clock: Clock = field(default_factory=Clock)
+    """The clock of all times: the IMU's, by the offset and drift of the parameters, unless asked for
+    otherwise."""
 
     @property
     def time(self) -> Floats:
@@ -212,6 +219,7 @@ class EstimateData:
             "model": self.model.name,
             "smoothed": self.smoothed,
             "online": self.online,
+            "clock": self.clock.as_dict(),
             "instants": len(self.time_ns),
             "requested": None if self.requested is None else len(self.requested.time_ns),
             "duration_s": float(self.time[-1]),

@@ -15,6 +15,7 @@ from jaxekf._support.compilation import jit
 from jaxekf._support.errors import FilterError, PrecisionError
 from jaxekf.estimation import padding, parameters, timeline
 from jaxekf.estimation._assembly import as_estimate, model_sensors
+from jaxekf.estimation.clock import ClockName, clock_of
 from jaxekf.estimation.output_times import Every, OutputTimes
 from jaxekf.estimation.result import Estimate
 from jaxekf.estimation.timeline import Timeline
@@ -47,6 +48,7 @@ def estimate(
     *,
     smooth: bool = False,
     at: OutputTimes | None = None,
+    clock: ClockName = "imu",
 ) -> Estimate:
     """Estimate one run with the extended Kalman filter or, with `smooth`, the smoother.
 
@@ -63,8 +65,12 @@ def estimate(
         Estimate each instant from the whole run (fixed-interval smoothing) instead of from the measurements
         up to that instant. Innovations are those of the filter in both cases.
     at
-        Additional output times: (N,) int64 nanoseconds on the recording's clock, or `jaxekf.every`. Without
-        it the instants are those of the measurements.
+        Additional output times: (N,) int64 nanoseconds on the clock of the estimate, or `jaxekf.every`.
+        Without it the instants are those of the measurements.
+    clock
+        Clock of all times of the estimate, of `at` too: ``imu`` moves them by the parameters' clock offset
+        (or latency) and drift, ``tracker`` leaves them on the clock of the tracker's samples. Both are the
+        same for a model without an offset between two clocks, and for an offset and drift of zero.
 
     Returns
     -------
@@ -95,7 +101,8 @@ def estimate(
     >>> print(f"NIS {estimate.mean_nis('optical'):.2f}")
     NIS 0.98
     """
-    return estimate_many([run], model, params, smooth=smooth, at=at if at is None else [at])[0]
+    asked = at if at is None else [at]
+    return estimate_many([run], model, params, smooth=smooth, at=asked, clock=clock)[0]
 
 
 def estimate_many(
@@ -105,6 +112,7 @@ def estimate_many(
     *,
     smooth: bool = False,
     at: Sequence[OutputTimes | None] | Every | None = None,
+    clock: ClockName = "imu",
 ) -> list[Estimate]:
     """Estimate several runs in parallel; the results are those of one `estimate` for each.
 
@@ -120,6 +128,8 @@ def estimate_many(
         As in `estimate`.
     at
         Additional output times of each run, None for a run without, or one grid for all runs.
+    clock
+        As in `estimate`.
 
     Returns
     -------
@@ -151,8 +161,9 @@ def estimate_many(
         )
     recordings = read(runs)
     chosen = adapted(get_model(model), recordings)
-    timelines = timeline.build_many(chosen, recordings, at)
     used = _parameters_per_run(chosen.parameters if params is None else params, len(runs))
+    clocks = [clock_of(chosen, own, clock) for own in used]
+    timelines = timeline.build_many(chosen, recordings, at, clocks)
     results = filter_timelines(chosen, used, timelines, smooth=smooth)
     return [
         as_estimate(chosen, own, recording, line, *result, smooth=smooth)

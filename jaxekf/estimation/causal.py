@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxekf._support.compilation import jit
 from jaxekf._support.errors import ModelError
 from jaxekf.estimation import timeline
-from jaxekf.estimation._assembly import named_outputs
+from jaxekf.estimation._assembly import named_outputs, on_clock
 from jaxekf.estimation.batch import (
     Run,
     estimate_many,
@@ -26,6 +26,7 @@ from jaxekf.estimation.batch import (
     read,
     sharing_devices,
 )
+from jaxekf.estimation.clock import ClockName, clock_of
 from jaxekf.estimation.result import Estimate
 from jaxekf.estimation.timeline import Timeline
 from jaxekf.filtering import ekf
@@ -87,6 +88,7 @@ def plan_extrapolation(line: Timeline, latency_ns: int, shift_s: float = 0.0) ->
         )
     start = int(line.time_ns[0, -1]) - round(float(line.steps.time[0, -1]) * NANOSECONDS)
     samples = start + np.round(np.asarray(line.steps.knots.time) * NANOSECONDS).astype(np.int64)
+    samples = line.clock.tracker_from_imu(samples)
     taken = line.time_ns[:, -1]
     known = taken + latency_ns
     until = np.append(known[1:], samples[-1] + 1)
@@ -125,7 +127,11 @@ def _extrapolated_outputs(model: Model, params: Parameters, beliefs: Belief, ste
 
 
 def estimate_online(
-    run: Run, model: str | Model = "tight", params: Parameters | None = None
+    run: Run,
+    model: str | Model = "tight",
+    params: Parameters | None = None,
+    *,
+    clock: ClockName = "imu",
 ) -> Estimate:
     """Estimate one run as a live system: at each input sample only with measurements that had arrived.
 
@@ -136,6 +142,8 @@ def estimate_online(
     model
         Name of a model with an input, ``module:attribute``, or a `Model`.
     params
+        As in `jaxekf.estimate`.
+    clock
         As in `jaxekf.estimate`.
 
     Returns
@@ -169,8 +177,9 @@ def estimate_online(
     """
     recording = read([run])[0]
     _need_input(get_model(model))
-    filtered = estimate_many([recording], model, params)[0]
-    line = timeline.build(filtered.model, recording)
+    filtered = estimate_many([recording], model, params, clock="tracker")[0]
+    known = clock_of(filtered.model, filtered.params, clock)
+    line = timeline.build(filtered.model, recording, clock=known)
     latency = set(line.latency_ns.values())
     if len(latency) != 1:
         raise ModelError(
@@ -190,7 +199,7 @@ def estimate_online(
         chosen, filtered.params, beliefs, view.with_input(_knots(line))
     )
     belief, outputs = jax.tree.map(lambda a: a[:, :, 0][view.latest], extrapolated)
-    return replace(
+    made = replace(
         filtered,
         time_ns=view.time_ns[view.latest],
         state=belief.mean,
@@ -202,6 +211,7 @@ def estimate_online(
             f"causal: only measurements that had arrived, {late / 1e6:g} ms late",
         ),
     )
+    return on_clock(made, line)
 
 
 def _need_input(model: Model) -> None:

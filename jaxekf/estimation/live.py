@@ -1,6 +1,7 @@
 """Live estimates: late measurements update past beliefs, the input extrapolates them to the present."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jaxekf._support.compilation import jit
 from jaxekf._support.errors import FilterError, ModelError
 from jaxekf.estimation import padding
 from jaxekf.estimation.batch import evaluate_outputs, require_float64
+from jaxekf.estimation.clock import clock_of
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.estimation.timeline import knots_from
 from jaxekf.filtering import ekf
@@ -52,7 +54,7 @@ class Known(NamedTuple):
     """
 
     time_ns: int
-    """The instant, int64 nanoseconds."""
+    """The instant, that of the latest input: int64 nanoseconds on the input's clock."""
     belief: Belief
     """State, and covariance (n, n) of its error vector."""
     outputs: dict[str, tuple[Any, Any]]
@@ -71,7 +73,8 @@ class Stream:
     Beliefs older than `horizon_s` before the latest input are final: a sample taken before them is too
     late, is not used, and is counted in `dropped`. Each call of `known` filters everything within the
     horizon again, so that its result is that of `jaxekf.run_filter` on all samples so far. The first call
-    compiles.
+    compiles. Input and sensors have stamps of their own clocks, which differ by the clock offset (or
+    latency) and drift of the parameters.
 
     Parameters
     ----------
@@ -82,7 +85,7 @@ class Stream:
     belief
         Mean and covariance at `start_ns`; samples taken at that time are used.
     start_ns
-        Time of the initial belief, int64 nanoseconds.
+        Time of the initial belief, int64 nanoseconds on the clock of the sensors.
     horizon_s
         Longest latency of a measurement, s.
     capacity
@@ -143,7 +146,9 @@ class Stream:
         self._rejecting_s: Any = None
         self._base_ns, self._base_is_open = int(start_ns), True
         self._start_ns = int(start_ns)
+        self._clock = replace(clock_of(model, self.params, "imu"), start_ns=self._start_ns)
         self._times: list[int] = []
+        self._placed: list[int] = []
         self._values: list[Floats] = []
         self._samples: dict[int, dict[str, _Sample]] = {}
 
@@ -153,7 +158,7 @@ class Stream:
         Parameters
         ----------
         time_ns
-            Time of the sample, int64 nanoseconds.
+            Time of the sample, int64 nanoseconds on its own clock.
         value
             (C,) the sample, in the units of the model's input.
 
@@ -167,11 +172,12 @@ class Stream:
                 f"got an input at {time_ns} ns after one at {self._times[-1]} ns, expected times that"
                 " increase; leave out repeated samples"
             )
-        before = self._times[-1] if self._times else self._start_ns
+        placed = int(self._clock.tracker_from_imu(np.array([time_ns], np.int64))[0])
+        before = self._placed[-1] if self._placed else self._start_ns
         usual = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0
-        if time_ns - before > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * usual):
+        if placed - before > max(LONGEST_INPUT_GAP_S * NANOSECONDS, 3 * usual):
             raise ModelError(
-                f"got an input {(time_ns - before) / NANOSECONDS:.3f} s after the last, expected no"
+                f"got an input {(placed - before) / NANOSECONDS:.3f} s after the last, expected no"
                 f" gap over {LONGEST_INPUT_GAP_S} s, because the input is not extrapolated; start a new"
                 " stream from a belief after the gap"
             )
@@ -182,6 +188,7 @@ class Stream:
                 " all channels of every sample"
             )
         self._times.append(int(time_ns))
+        self._placed.append(placed)
         self._values.append(sample)
 
     def put(
@@ -194,7 +201,8 @@ class Stream:
         sensor
             Name of a sensor of the model.
         taken_ns
-            Time at which the sample was *taken*, not that of its arrival, int64 nanoseconds.
+            Time at which the sample was *taken*, not that of its arrival, int64 nanoseconds on the
+            sensors' clock.
         value
             The sample, of the shapes of the sensor's space.
         mask
@@ -233,12 +241,12 @@ class Stream:
         FilterError
             A covariance is no longer finite and positive definite.
         """
-        if len(self._times) < 2 or self._times[-1] < self._base_ns:
+        if len(self._times) < 2 or self._placed[-1] < self._base_ns:
             raise ModelError(
                 f"got {len(self._times)} samples of the input from {self._base_ns} ns on, expected two;"
                 " call known after more input"
             )
-        now = self._times[-1]
+        now = self._placed[-1]
         while True:
             instants = self._open_instants(now)
             if len(instants) <= self._capacity:
@@ -247,12 +255,12 @@ class Stream:
             self._filter(instants[: self._capacity], final)
         final = sum(1 for t in instants if t < now - self._horizon_ns)
         belief, outputs = self._filter(instants, final)
-        return Known(now, belief, outputs)
+        return Known(self._times[-1], belief, outputs)
 
     def _open_instants(self, now: int) -> list[int]:
         """Instants up to `now` that are not final: those of the input and of the samples."""
         first = self._base_ns if self._base_is_open else self._base_ns + 1
-        times = {t for t in self._times if first <= t <= now}
+        times = {t for t in self._placed if first <= t <= now}
         return sorted(times | {t for t in self._samples if t <= now})
 
     def _filter(self, instants: list[int], final: int) -> tuple[Belief, dict[str, Any]]:
@@ -280,8 +288,8 @@ class Stream:
         """Discard the samples before an instant that has become final."""
         self._base_ns, self._base_is_open = time_ns, False
         self._samples = {t: s for t, s in self._samples.items() if t > time_ns}
-        kept = sum(1 for t in self._times if t < time_ns - _INPUT_KEPT_NS)
-        del self._times[:kept], self._values[:kept]
+        kept = sum(1 for t in self._placed if t < time_ns - _INPUT_KEPT_NS)
+        del self._times[:kept], self._placed[:kept], self._values[:kept]
 
     def _steps(self, instants: list[int]) -> Steps:
         """Epochs of one substep each, padded to the capacity."""

@@ -50,7 +50,7 @@ class Every:
 
 
 OutputTimes = Times | Every
-"""Output times (N,) in int64 nanoseconds on the recording's clock, or a grid."""
+"""Output times (N,) in int64 nanoseconds on the estimate's clock, or a grid."""
 
 
 def every(seconds: float) -> Every:
@@ -95,7 +95,7 @@ def read_output_times(path: Path | str) -> Times:
     Parameters
     ----------
     path
-        A file with the column ``time``, decimal seconds on the recording's clock; others are ignored.
+        A file with the column ``time``, decimal seconds on the estimate's clock; others are ignored.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def select_output_times(
         raise RecordingError(
             place,
             f"requested times of type {times.dtype} and shape {times.shape}, or masked",
-            "int64 nanoseconds on the recording's clock, shape (N,), none masked",
+            "int64 nanoseconds on the estimate's clock, shape (N,), none masked",
             "np.round(seconds * 1e9).astype(np.int64), or jaxekf.every(seconds)",
         )
     times = times.astype(np.int64)
@@ -170,7 +170,7 @@ def select_output_times(
         if times.size:
             got = f"requested times from {times[0] / NANOSECONDS:.6f} to {times[-1] / NANOSECONDS:.6f} s"
         raise RecordingError(
-            place, got, f"some within the run, {run}", "times in the recording's clock and unit"
+            place, got, f"some within the run, {run}", "times on the estimate's clock and unit"
         )
     if len(inside) == len(times):
         return inside, None

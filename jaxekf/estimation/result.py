@@ -26,7 +26,9 @@ class Estimate(EstimateData):
     Attributes
     ----------
     time_ns
-        (N,) int64 nanoseconds on the recording's clock; `time` is in seconds since the first instant.
+        (N,) int64 nanoseconds on `clock`; `time` is in seconds since the first instant.
+    clock
+        `Clock` of all times: the IMU's unless ``clock="tracker"`` was asked for.
     state
         The model's state with a leading axis (N,).
     cov
@@ -65,7 +67,7 @@ class Estimate(EstimateData):
         ``.csv`` is `estimate.csv` of the result folder: state, outputs, standard deviations, rounded to 12
         digits. ``.npz`` and ``.h5`` or ``.hdf5`` hold everything to the last bit, see
         `jaxekf.read_export`. ``.tum`` is the trajectory in the TUM format, ``timestamp tx ty tz qx qy qz
-        qw``: the recording's time in seconds, exact to the nanosecond, the position (zero for a model
+        qw``: the time on `clock` in seconds, exact to the nanosecond, the position (zero for a model
         without one) and the attitude, body to reference, scalar last.
 
         Parameters

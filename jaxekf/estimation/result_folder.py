@@ -80,7 +80,10 @@ def write_file(made: EstimateData, form: str, file: Path) -> None:
             made.time_ns,
             made.outputs["attitude"].value,
             None if position is None else position.value,
-            [f"run {made.run}, model {made.model.name}", *_comments(made)],
+            [
+                f"run {made.run}, model {made.model.name}, time{made.clock.label}",
+                *_comments(made),
+            ],
         )
     else:
         {"npz": export.write_npz, "hdf5": export.write_hdf5}[form](file, _entries(made))
@@ -103,7 +106,7 @@ def _document(
     given: dict[str, Any] = {"diagnosis": diagnosis, "score": score}
     return ResultDocument(
         **made.summary(),
-        estimate_columns=[Column("time", "s"), *columns],
+        estimate_columns=[Column("time", "s", _frame(made)), *columns],
         innovation_units={
             name: list(manifold.error_units(made.model.sensor(name).space)) for name in made.sensors
         },
@@ -114,6 +117,16 @@ def _document(
         parameters=_parameters(made),
         **{key: value for key, value in given.items() if value is not None},
     )
+
+
+def _frame(made: EstimateData) -> str:
+    """The clock of the times, as the frame of their column."""
+    return f"{made.clock.name} clock"
+
+
+def _of_time(made: EstimateData) -> dict[str, str]:
+    """Attributes of times in an NPZ or HDF5 file."""
+    return {"unit": "ns", "clock": made.clock.name}
 
 
 def _parameters(made: EstimateData) -> dict[str, dict[str, Quantity]]:
@@ -131,6 +144,7 @@ def _comments(made: EstimateData) -> list[str]:
         "schema_version": SCHEMA_VERSION,
         "smoothed": made.smoothed,
         "online": made.online,
+        "clock": made.clock.as_dict(),
         "provenance": made.provenance,
         "parameters": _parameters(made),
         "account": made.account,
@@ -147,6 +161,7 @@ def _facts(made: EstimateData) -> dict[str, Any]:
         "model": made.model.name,
         "smoothed": made.smoothed,
         "online": made.online,
+        "clock": json.dumps(made.clock.as_dict()),
         "requested_times_only": made.excerpt,
         "log_likelihood": made.log_likelihood,
     }
@@ -154,7 +169,7 @@ def _facts(made: EstimateData) -> dict[str, Any]:
 
 def _entries(made: EstimateData) -> dict[str, Entry]:
     """The whole estimate, by the paths of an NPZ or HDF5 file."""
-    found = {"": Entry(None, _facts(made)), "time_ns": Entry(made.time_ns, {"unit": "ns"})}
+    found = {"": Entry(None, _facts(made)), "time_ns": Entry(made.time_ns, _of_time(made))}
     space = made.model.space
     for part, leaf in zip(manifold.parts(space), jax.tree.leaves(made.state), strict=True):
         found[f"state/{part.name}"] = Entry(np.asarray(leaf), _attributes(part.manifold, ""))
@@ -179,7 +194,7 @@ def _innovations(made: EstimateData) -> dict[str, Entry]:
     for name, record in made.sensors.items():
         about = _error_attributes(made.model.sensor(name).space)
         columns = {
-            "time_ns": Entry(record.time_ns, {"unit": "ns"}),
+            "time_ns": Entry(record.time_ns, _of_time(made)),
             "residual": Entry(record.residual, about),
             "covariance": Entry(record.cov, about),
             "used": Entry(record.used),
@@ -228,6 +243,7 @@ def _write_covariance(made: EstimateData, path: Path) -> None:
     np.savez_compressed(
         path,
         schema_version=SCHEMA_VERSION,
+        clock=made.clock.name,
         time_ns=made.time_ns,
         cov=made.cov,
         labels=np.array(made.error_labels),

@@ -10,29 +10,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation._run_samples import check_input, extrapolation_notes, read_sensor
 from jaxekf.estimation._step_layout import arrange, epochs_of, slow_sensors
+from jaxekf.estimation.clock import Clock
 from jaxekf.estimation.output_times import OutputTimes, select_output_times
-from jaxekf.filtering.model import Model, Sensor, Start
+from jaxekf.filtering.model import Model, Start
 from jaxekf.filtering.steps import Knots, Steps
-from jaxekf.recordings.gaps import LONGEST_INPUT_GAP_S, longest_ns
 from jaxekf.recordings.sample_selection import (
     count,
     cut,
     first_visible,
     hold,
     of_rows,
-    take,
     visible,
 )
 from jaxekf.recordings.types import NANOSECONDS, Recording, Samples, Times
-
-_EXTRAPOLATED_S = 0.5
-"""A note names longer intervals without any sample."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,7 @@ class Timeline:
     steps: Steps
     """The inputs of the filter, leading axes (K, S)."""
     time_ns: Times
-    """(K, S) int64 nanoseconds at the end of each substep."""
+    """(K, S) int64 nanoseconds at the end of each substep, on the tracker's clock."""
     first: dict[str, Any]
     """First visible sample of each sensor."""
     account: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -72,6 +68,22 @@ class Timeline:
     """(N,) requested output times, a subset of `time_ns`; None without a request."""
     measured_ns: Times | None = None
     """(M,) instants of the measurements, if there are output times; None without a request."""
+    clock: Clock = field(default_factory=Clock)
+    """The clock of the estimate, and what the tracker's differs from it."""
+    exact_ns: tuple[Times, Times] | None = None
+    """Instants whose time on the IMU's clock is known to the nanosecond, and that time; None if no clock
+    differs."""
+
+    def on_clock(self, time_ns: Times) -> Times:
+        """Instants of the timeline on the clock of the estimate."""
+        if self.clock.name != "imu" or self.exact_ns is None:
+            return time_ns
+        instants, exact = self.exact_ns
+        at = np.clip(np.searchsorted(instants, time_ns), 0, len(instants) - 1)
+        moved = np.where(instants[at] == time_ns, exact[at], self.clock.from_tracker(time_ns))
+        # Instants a nanosecond apart must not become one.
+        count = np.arange(len(moved))
+        return np.maximum.accumulate(moved - count) + count
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -84,8 +96,11 @@ def build(
     recording: Recording,
     slow: tuple[str, ...] | None = None,
     at: OutputTimes | None = None,
+    clock: Clock | None = None,
 ) -> Timeline:
     """The timeline of one recording for one model.
+
+    It is on the tracker's clock; the IMU's samples have their place on it by `clock`.
 
     Parameters
     ----------
@@ -96,8 +111,11 @@ def build(
     slow
         Names of the sensors that are sampled only at the ends of epochs; None chooses them by their rates.
     at
-        Output times, (N,) int64 nanoseconds or a grid, added as instants without samples. Times outside
-        the run are left out, with a note.
+        Output times, (N,) int64 nanoseconds or a grid, added as instants without samples, on the clock of
+        the estimate. Times outside the run are left out, with a note.
+    clock
+        The clock of the estimate, by `jaxekf.estimation.clock.clock_of`; None takes all stamps for those of
+        one clock.
 
     Returns
     -------
@@ -123,12 +141,17 @@ def build(
     >>> jaxekf.timeline.build(model, run, at=jaxekf.every(0.01)).requested_ns.shape
     (2401,)
     """
-    samples = {s.name: _read(s, recording) for s in model.sensors}
-    driver, counted = None, dict(samples)
+    samples = {s.name: read_sensor(s, recording) for s in model.sensors}
+    driver, counted, clock = None, dict(samples), clock or Clock()
     if model.input is not None:
-        counted[model.input.name] = model.input.source(recording)
-        driver = _check_input(counted[model.input.name], recording, model.input.name)
-    start, end, start_sample = _run_interval(model, recording, samples, driver)
+        counted[model.input.name] = raw = model.input.source(recording)
+        driver = check_input(raw, recording, model.input.name)
+        clock = clock.starting_with(int(driver.time_ns[0]))
+    start, end, start_sample = _run_interval(model, recording, samples, driver, clock)
+    clock = replace(clock, start_ns=start)
+    if model.input is not None:
+        raw = counted[model.input.name]
+        counted[model.input.name] = replace(raw, time_ns=clock.tracker_from_imu(raw.time_ns))
     account = {
         name: of_rows(count(stream, start, end), stream, recording.intake, start, end)
         for name, stream in counted.items()
@@ -137,14 +160,17 @@ def build(
     if model.hold_to is not None:
         samples = hold(samples, model.hold_to, account)
     events = [stream.time_ns for stream in samples.values()]
+    exact = None
     if driver is not None:
-        inside = (driver.time_ns >= start) & (driver.time_ns <= end)
-        events.append(driver.time_ns[inside])
+        placed = clock.tracker_from_imu(driver.time_ns)
+        inside = (placed >= start) & (placed <= end)
+        events.append(placed[inside])
+        exact = placed[inside], driver.time_ns[inside]
     notes = (start_sample.note,) if start_sample is not None and start_sample.note else ()
     if part := recording.info.get("part"):
         notes = (f"part {part}", *notes)
     if driver is None and model.hold_to is None:
-        notes += _extrapolation_notes(samples, start)
+        notes += extrapolation_notes(samples, start)
     requested = measured = None
     if at is not None and model.hold_to is not None:
         raise ModelError(
@@ -152,7 +178,12 @@ def build(
             f" samples of {model.hold_to}, and more steps would change it; use another model, such as loose"
         )
     if at is not None:
-        requested, note = select_output_times(at, start, end, recording.path or recording.name)
+        first, last = clock.from_tracker(np.array([start, end])).tolist()
+        asked, note = select_output_times(at, first, last, recording.path or recording.name)
+        requested = asked
+        if clock.name == "imu":
+            requested = np.clip(clock.tracker_from_imu(asked), start, end)
+            exact = _joined(exact, (requested, asked))
         measured = np.unique(np.concatenate([*events, np.array([start], np.int64)]))
         events.append(requested)
         notes += (note,) if note else ()
@@ -178,7 +209,18 @@ def build(
         latency,
         requested,
         measured,
+        clock,
+        exact,
     )
+
+
+def _joined(exact: tuple[Times, Times] | None, more: tuple[Times, Times]) -> tuple[Times, Times]:
+    """Instants with their exact times, each once, `more` before `exact`."""
+    both = (
+        more if exact is None else tuple(np.concatenate(p) for p in zip(more, exact, strict=True))
+    )
+    instants, first = np.unique(both[0], return_index=True)
+    return instants, both[1][first]
 
 
 def _cut_to_run(
@@ -199,7 +241,10 @@ def _cut_to_run(
 
 
 def build_many(
-    model: Model, recordings: Sequence[Recording], at: Sequence[OutputTimes | None] | None = None
+    model: Model,
+    recordings: Sequence[Recording],
+    at: Sequence[OutputTimes | None] | None = None,
+    clocks: Sequence[Clock] | None = None,
 ) -> list[Timeline]:
     """Timelines of several recordings, with the same slow sensors so that they can be stacked.
 
@@ -209,6 +254,8 @@ def build_many(
         As in `build`.
     at
         Output times of each recording, None for one without.
+    clocks
+        The clock of each estimate; None takes all stamps of a run for those of one clock.
 
     Returns
     -------
@@ -230,9 +277,10 @@ def build_many(
     """
     timelines: list[Timeline] = []
     at = [None] * len(recordings) if at is None else at
-    for recording, requested in zip(recordings, at, strict=True):
+    clocks = [Clock()] * len(recordings) if clocks is None else clocks
+    for recording, requested, clock in zip(recordings, at, clocks, strict=True):
         slow = tuple(timelines[0].steps.slow) if timelines else None
-        timelines.append(build(model, recording, slow, requested))
+        timelines.append(build(model, recording, slow, requested, clock))
     return timelines
 
 
@@ -276,83 +324,16 @@ def from_steps(name: str, steps: Steps, first: dict[str, Any], start_ns: int = 0
     return Timeline(name, steps, time_ns, first)
 
 
-def _read(sensor: Sensor, recording: Recording) -> Samples:
-    if sensor.source is None:
-        raise ModelError(
-            f"sensor '{sensor.name}' got a recording, expected arrays because it names no source;"
-            " give it a source"
-        )
-    samples = sensor.source(recording)
-    mask = np.asarray(samples.mask)
-    if mask.ndim == 1:
-        mask = np.repeat(mask[:, None], sensor.rows, axis=1)
-    aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)
-    return replace(samples, mask=mask, aux=aux)
-
-
-def _inert_aux(name: str, values: Any, mask: NDArray[np.bool_], recording: Recording) -> Any:
-    """Auxiliary data, with a finite value in place of NaN in masked samples.
-
-    The model's functions are evaluated at masked samples too, where a NaN would spoil the gradient.
-    """
-    values = np.array(values)
-    known = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
-    shown = mask.any(axis=1)
-    bad = np.flatnonzero(shown & ~known)
-    if bad.size:
-        raise RecordingError(
-            recording.path or recording.name,
-            f"auxiliary data of {name} that is not finite at sample {int(bad[0])}",
-            "finite data for every visible sample",
-            "masking the sample",
-        )
-    values[~known] = values[np.argmax(known)] if known.any() else 1.0
-    return values
-
-
-def _check_input(driver: Samples, recording: Recording, name: str) -> Samples:
-    """The valid samples of the input. It cannot be masked, so that a long gap is an error."""
-    driver = take(driver, np.asarray(driver.mask))
-    place = recording.path or recording.name
-    count = len(driver.time_ns)
-    if count < 2:
-        raise RecordingError(
-            place, f"{count} samples of {name}", "at least two", "a longer recording"
-        )
-    steps = np.diff(driver.time_ns)
-    longest = int(np.argmax(steps))
-    if steps[longest] > longest_ns(driver.time_ns):
-        begin = driver.time_ns[longest] / NANOSECONDS
-        raise RecordingError(
-            place,
-            f"a gap of {steps[longest] / NANOSECONDS:.3f} s in {name} at {begin:.6f} s",
-            f"none longer than {LONGEST_INPUT_GAP_S} s",
-            "cutting the run there (jaxekf.split_at_gaps), or a model that measures it (loose_rate)",
-        )
-    return driver
-
-
-def _extrapolation_notes(samples: dict[str, Samples], start: int) -> tuple[str, ...]:
-    """A note on long intervals without a sample of any sensor."""
-    seen = [stream.time_ns[visible(stream)] for stream in samples.values()]
-    times = np.unique(np.concatenate(seen))
-    steps = np.diff(times) / NANOSECONDS
-    long = np.flatnonzero(steps > _EXTRAPOLATED_S)
-    if not long.size:
-        return ()
-    at = ", ".join(f"{(times[i] - start) / NANOSECONDS:.3f}" for i in long[:5])
-    return (
-        f"at {at} s{' and later' if long.size > 5 else ''} there is no sample of any sensor for up to"
-        f" {steps[long].max():.3f} s: there the estimate is extrapolated",
-    )
-
-
 def _describe(times: Times) -> str:
     return f"{times[0] / NANOSECONDS:.6f} to {times[-1] / NANOSECONDS:.6f} s"
 
 
 def _run_interval(
-    model: Model, recording: Recording, samples: dict[str, Samples], driver: Samples | None
+    model: Model,
+    recording: Recording,
+    samples: dict[str, Samples],
+    driver: Samples | None,
+    clock: Clock,
 ) -> tuple[int, int, Start | None]:
     """First and last time of the run, and the start that the model found.
 
@@ -362,9 +343,10 @@ def _run_interval(
     start = min(int(s.time_ns[0]) for s in samples.values())
     end = max(int(s.time_ns[-1]) for s in samples.values())
     if driver is not None:
+        times = clock.tracker_from_imu(driver.time_ns)
         for name, stream in samples.items():
-            _need_overlap(place, name, stream.time_ns, "the input", driver.time_ns)
-        start, end = int(driver.time_ns[0]), int(driver.time_ns[-1])
+            _need_overlap(place, name, stream.time_ns, "the input", times)
+        start, end = int(times[0]), int(times[-1])
     elif model.hold_to is None:
         first, *others = samples
         for other in others:

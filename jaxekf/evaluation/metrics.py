@@ -5,8 +5,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxekf.estimation.result import Estimated
+from jaxekf.evaluation._time_shift import attitude_shift, rate_shift
 from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
-from jaxekf.recordings.types import Floats, Optical, Recording, Times, to_scipy
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Optical, Recording, Times, to_scipy
+
+_NAN = float("nan")
+_LEAST_SHIFT_S, _LESS = 1e-3, 0.8
+"""A shift is a warning if it is longer, and if it lowers the RMSE to less than this part."""
 
 
 class Score(NamedTuple):
@@ -39,6 +44,45 @@ class Score(NamedTuple):
     """NEES of the position, as `attitude_nees`."""
     samples: int
     """Number of instants of the estimate that count."""
+    time_shift_s: float = _NAN
+    """Shift of the estimate's times at which its attitude agrees best with the encoder, constant rotations
+    apart, s; NaN if the motion does not show it."""
+    time_shift_sigma_s: float = _NAN
+    """Its standard deviation."""
+    shifted_rmse_deg: float = _NAN
+    """Attitude RMSE after that shift, deg."""
+    rate_shift_s: float = _NAN
+    """As `time_shift_s`, for the rate."""
+    rate_shift_sigma_s: float = _NAN
+    """Its standard deviation."""
+
+    def sentences(self) -> tuple[str, ...]:
+        """Warnings: by how much a disagreement of clocks spoils the score, and whose clock it can be."""
+        spoilt = (
+            abs(self.time_shift_s) > max(5.0 * self.time_shift_sigma_s, _LEAST_SHIFT_S)
+            and self.shifted_rmse_deg < _LESS * self.attitude_rmse_deg
+        )
+        if not spoilt:
+            return ()
+        shift, sigma = self.time_shift_s, self.time_shift_sigma_s
+        found = (
+            f"the attitude agrees best with the encoder {1e3 * abs(shift):.1f} ± {1e3 * sigma:.1f} ms"
+            f" {'later' if shift > 0 else 'earlier'}: RMSE {self.shifted_rmse_deg:.3g} deg there instead of"
+            f" {self.attitude_rmse_deg:.3g} deg"
+        )
+        certain = self.rate_shift_sigma_s < 0.1 * abs(shift)
+        same = abs(self.rate_shift_s - shift) < 0.2 * abs(shift) + 3.0 * self.rate_shift_sigma_s
+        none = abs(self.rate_shift_s) < 0.2 * abs(shift) + 3.0 * self.rate_shift_sigma_s
+        encoder = (
+            "the stamps of encoder and IMU disagree: state in recording.toml"
+            f" time_shift = {-shift:.4f} under [encoder], or {shift:.4f} under [imu] if those are off"
+        )
+        tracker = "tracker and IMU disagree: run jaxekf align and use its calibration.toml"
+        if certain and same:
+            return (f"{found}; the rate shows the same, so that {encoder}",)
+        if certain and none:
+            return (f"{found}; the rate does not show it, so that {tracker}",)
+        return (f"{found}; either {encoder}, or {tracker}",)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -147,7 +191,8 @@ def mean_nees(error: Floats, cov: Floats) -> float:
 def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
     """Errors (N, 3) of the outputs attitude, rate, position and velocity against the encoder.
 
-    Attitude errors are rotation vectors in the body frame, all in SI units. Instants whose nearest encoder
+    The encoder is compared on the IMU's clock, its stamps less its `latency`. Attitude errors are rotation
+    vectors in the body frame, all in SI units. Instants whose nearest encoder
     sample is not scored or not known are NaN.
 
     Raises
@@ -156,16 +201,17 @@ def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats
         If the run has no encoder.
     """
     encoder, outputs = recording.need_encoder(), estimate.outputs
-    truth = encoder_at(encoder, estimate.time_ns)
+    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    truth = encoder_at(encoder, time_ns)
     errors: dict[str, Floats] = {}
     if "attitude" in outputs:
         errors["attitude"] = attitude_error(outputs["attitude"].value, truth.q_ref_body)
     if "rate" in outputs:
-        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, estimate.time_ns)
+        errors["rate"] = outputs["rate"].value - encoder_rate_at(encoder, time_ns)
     if "position" in outputs and truth.position is not None:
         errors["position"] = outputs["position"].value - truth.position
     if "velocity" in outputs and truth.position is not None:
-        velocity = encoder_velocity_at(encoder, estimate.time_ns)
+        velocity = encoder_velocity_at(encoder, time_ns)
         errors["velocity"] = outputs["velocity"].value - velocity
     return {name: np.where(truth.scored[:, None], e, np.nan) for name, e in errors.items()}
 
@@ -175,7 +221,8 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
 
     Errors count at instants of the estimate whose nearest encoder sample is scored, from `burn_in_s`
     on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
-    body's origin in the reference frame.
+    body's origin in the reference frame. The encoder's stamps, less its `latency`, are taken for those of
+    the IMU's clock.
 
     Parameters
     ----------
@@ -189,7 +236,8 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     Returns
     -------
     Score
-        RMSE in deg, deg/s and mm; NEES divided by its degrees of freedom.
+        RMSE in deg, deg/s and mm; NEES divided by its degrees of freedom. `Score.sentences` names a
+        disagreement of the clocks that spoils it.
 
     Raises
     ------
@@ -205,7 +253,8 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
-    judged = encoder_at(recording.need_encoder(), estimate.time_ns).scored
+    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    judged = encoder_at(recording.need_encoder(), time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)
     errors = scored_errors(estimate, recording)
 
@@ -221,7 +270,31 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
 
     attitude, rate = (float(np.rad2deg(rmse(name))) for name in ("attitude", "rate"))
     position = 1e3 * rmse("position"), nees("position")
-    return Score(attitude, rate, nees("attitude"), *position, int(judged.sum()))
+    found = Score(attitude, rate, nees("attitude"), *position, int(judged.sum()))
+    return _with_shifts(found, estimate, recording, estimate.time >= burn_in_s)
+
+
+def _with_shifts(found: Score, estimate: Estimated, recording: Recording, settled: Flags) -> Score:
+    """A score with the time shifts between estimate and encoder."""
+    encoder, outputs = recording.need_encoder(), estimate.outputs
+    if "attitude" not in outputs or not settled.any():
+        return found
+    time_ns, q = (
+        estimate.clock.to_imu(estimate.time_ns)[settled],
+        outputs["attitude"].value[settled],
+    )
+    shift, sigma = attitude_shift(encoder, time_ns, q)
+    if not np.isfinite(shift):
+        return found
+    truth = encoder_at(encoder, time_ns + round(shift * NANOSECONDS))
+    error = attitude_error(q[truth.scored], truth.q_ref_body[truth.scored])
+    found = found._replace(
+        time_shift_s=shift, time_shift_sigma_s=sigma, shifted_rmse_deg=float(np.rad2deg(rms(error)))
+    )
+    if "rate" not in outputs:
+        return found
+    rate = rate_shift(encoder, time_ns, outputs["rate"].value[settled], shift)
+    return found._replace(rate_shift_s=rate.shift_s, rate_shift_sigma_s=rate.sigma_s)
 
 
 def hold_last(optical: Optical, time_ns: Times) -> Floats:

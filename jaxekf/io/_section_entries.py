@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxekf._support.errors import RecordingError
 from jaxekf.io._csv_text import DELIMITERS
+from jaxekf.io._stamp_repair import ENTRIES
 from jaxekf.io.csv_table import QUATERNION, TIME_UNITS, Layout
 from jaxekf.recordings.facts import BODY_TO_REFERENCE, wrong_entry
 from jaxekf.recordings.types import Floats
@@ -24,9 +25,10 @@ COMMON = {
     "skip_lines": "number of lines before the header (default 0)",
     "delimiter": 'one of "," ";" and tab (default: as the header shows)',
     "time_unit": 'unit of the times: "s", "ms", "us" or "ns" (default "s")',
+    **ENTRIES,
 }
 """Entries of every stream's section, and what they mean."""
-OF_THE_FILE = ("file", "columns", "skip_lines", "delimiter", "time_unit")
+OF_THE_FILE = ("file", "columns", "skip_lines", "delimiter", "time_unit", *ENTRIES)
 """Entries that are of no more use once a file is read."""
 _DIRECTIONS = ("body to reference", "reference to body")
 

@@ -59,6 +59,8 @@ class Table:
     """Names as this package knows them; blank for a column that is not read."""
     text: Text
     time_unit: str = "s"
+    times: Times | None = None
+    """(N,) stamps that were repaired, ns; None to take those of the column ``time``."""
 
     @property
     def lines(self) -> Indices:
@@ -89,7 +91,8 @@ class Table:
 
     def take(self, chosen: NDArray[np.bool_]) -> "Table":
         """The rows that a mask (N,) chooses."""
-        return replace(self, text=self.text.take(chosen))
+        times = None if self.times is None else self.times[chosen]
+        return replace(self, text=self.text.take(chosen), times=times)
 
     def error(self, row: int, column: str, got: str, expected: str, hint: str) -> RecordingError:
         """The error of one cell."""
@@ -296,7 +299,9 @@ def words(table: Table, name: str) -> NDArray[np.str_]:
 
 
 def stamps(table: Table) -> Times:
-    """The column ``time`` (N,) in nanoseconds, in any order."""
+    """The column ``time`` (N,) in nanoseconds, in any order, with repairs."""
+    if table.times is not None:
+        return table.times
     exponent = TIME_UNITS[table.time_unit]
 
     def parsed(row: int) -> int:

@@ -89,7 +89,10 @@ def latency_ns(about: Mapping[str, Any], label: str, place: Path | str) -> int:
     seconds = as_number(value)
     if seconds is None or not 0.0 <= seconds <= _LONGEST_LATENCY_S:
         expected = f"finite seconds, 0 or more, {_LONGEST_LATENCY_S:g} at most"
-        raise wrong_entry(place, f"{label}.latency", value, expected)
+        hint = f"correcting {FILE}"
+        if seconds is not None and seconds < 0.0:
+            hint = f"time_shift = {-seconds:g} there, which is added to the stamps and has any sign"
+        raise wrong_entry(place, f"{label}.latency", value, expected, hint)
     return round(seconds * NANOSECONDS)
 
 

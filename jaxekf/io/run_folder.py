@@ -17,6 +17,7 @@ import tomli_w
 from jaxekf._support.errors import RecordingError
 from jaxekf.checks import plausibility
 from jaxekf.io import _section_entries as section_entries
+from jaxekf.io import _stamp_repair as stamp_repair
 from jaxekf.io import container, description
 from jaxekf.io.atomic import whole_folder
 from jaxekf.io.csv_table import Table, read_table, write_sheet
@@ -98,7 +99,12 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
             for one in tables:
                 _check_hash(one, hashes)
                 sources[one.path.name] = one.text.sha256
+            repair = stamp_repair.stated(label, section, place, label in ("markers", "camera"))
+            table, notes = stamp_repair.mended(table, repair)
             stream, account = schema.read_table(table, Source(section, place, sort), *tables[1:])
+            if not repair.restamp:
+                notes += stamp_repair.burst_notes(label, stream.time_ns)
+            account = replace(account, notes=(*account.notes, *notes))
             read[label], accounts[label] = stream, _completed(account, table, stream.time_ns)
     if not read:
         files = " or ".join(f"{label}.csv" for label in STREAMS)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxekf.recordings import sensor_rates
 from jaxekf.recordings.accounts import Indices, Intake, Place, Reason
 from jaxekf.recordings.quaternion_norms import judge_quaternions, whole
 from jaxekf.recordings.types import Encoder, Flags, Floats, Imu, Optical, Times
@@ -21,6 +22,8 @@ SLOWEST_S, SLOWEST_TRACKER_S = 0.5, 1.5
 FASTEST_S = 2e-5
 _BEYOND = 1e6
 """SI: beyond any sensor, such as the huge numbers that mark a lost tool."""
+_SHARED = 0.2
+"""Share of rows with the stamp of the one before, from which on stamps are shared on purpose."""
 STATUS_OK = ("ok", "0")
 """Words of a status that mean a good sample, unless others are stated; in lower case."""
 NDI_STATUS = {
@@ -110,34 +113,37 @@ def imu(
     """An IMU's samples, SI units; rows of which gyroscope or accelerometer is not finite are masked: they
     are left out of the stream, for an input cannot be masked.
 
-    A magnetometer may be slower than the rest: where it is not finite it was not read. Raises
-    `RecordingError` where no row is finite, and what `in_order` and `check_rate` raise.
+    A magnetometer may be slower than the rest: where it is not finite it was not read. An accelerometer
+    at a rate of its own, blank between its samples or in rows of its own, is brought to the gyroscope's
+    samples by `sensor_rates.at_gyroscope`. Raises `RecordingError` where no row is finite, and what
+    `in_order` and `check_rate` raise.
     """
     numbers = [a for a in (gyroscope, accelerometer, magnetometer) if a is not None]
     order, account = in_order(place, time_ns, numbers, sort=sort)
     place, time_ns = place.take(order), time_ns[order]
     check_rate(place, time_ns)
-    bad, far = np.zeros(len(order), bool), np.zeros(len(order), bool)
-    for needed in (gyroscope, accelerometer):
-        if needed is not None:
-            bad |= ~whole(chosen(needed, order))
-            far |= huge(chosen(needed, order))
+    gyroscope = chosen(gyroscope, order)
+    others = (None if a is None else chosen(a, order) for a in (accelerometer, magnetometer))
+    joined = sensor_rates.at_gyroscope(time_ns, gyroscope, *others)
+    bad, far = ~whole(gyroscope), huge(gyroscope)
+    if joined.accelerometer is not None:
+        bad |= ~whole(joined.accelerometer)
+        far |= huge(joined.accelerometer)
+    reasons = {"of another sensor, without gyroscope": joined.alone}
     valid, account = mask_first(
-        place, time_ns, account, {"not finite": bad, "beyond any sensor": far}
+        place, time_ns, account, reasons | {"not finite": bad, "beyond any sensor": far}
     )
     if not valid.any():
         raise place.error(
             None, None, f"no finite row among {account.rows}", "at least one", "recording again"
         )
-    streams = [
-        None if a is None else chosen(a, order[valid])
-        for a in (gyroscope, accelerometer, magnetometer)
-    ]
-    gyro, *others = streams
-    assert gyro is not None
     assert account.numbers is not None
-    account = replace(account, numbers=account.numbers[valid])
-    return Imu(time_ns[valid], gyro, *others), account
+    notes = (*account.notes, *joined.notes)
+    account = replace(account, numbers=account.numbers[valid], notes=notes)
+    kept = np.flatnonzero(valid)
+    others = (joined.accelerometer, joined.magnetometer)
+    streams = (None if a is None else chosen(a, kept) for a in others)
+    return Imu(time_ns[valid], chosen(gyroscope, kept), *streams), account
 
 
 def encoder(
@@ -149,6 +155,7 @@ def encoder(
     scored: Flags | None = None,
     hidden: Flags | None = None,
     sort: bool = False,
+    latency_ns: int = 0,
 ) -> tuple[Encoder, Intake]:
     """Truth (w, x, y, z, tool to the tracker's reference; metres), what is not a rotation masked, as are
     rows that `hidden` (N,) names.
@@ -169,7 +176,8 @@ def encoder(
     need_usable(place, valid, account, "row", hint)
     account = replace(account, notes=(*account.notes, *notes))
     position = None if position is None else position[order]
-    return Encoder(time_ns, unit, valid, scored[order] & valid, position), account
+    scored = scored[order] & valid
+    return Encoder(time_ns, unit, valid, scored, position, latency_ns), account
 
 
 def judge_markers(
@@ -266,6 +274,8 @@ def in_order(
             got = f"{named}{_seconds(time_ns[at])} s twice with other numbers"
             expected = "each time once" if part is None else "each of them once a frame"
             hint = "exporting times with more digits, or removing one of the rows"
+            if part is None and place.unit == "line" and len(again) > _SHARED * len(time_ns):
+                hint = "exporting times with more digits, or spread_stamps = true in recording.toml"
             raise place.error(at, "time", got, expected, hint)
     kept = np.ones(len(time), bool)
     kept[again] = False
@@ -348,7 +358,8 @@ def check_rate(place: Place, time_ns: Times, slowest_s: float = SLOWEST_S) -> No
     if len(time_ns) < 3:
         return
     step = float(np.median(np.diff(time_ns))) * 1e-9
-    if 0.0 < step < FASTEST_S:
+    mean = float(time_ns[-1] - time_ns[0]) / (len(time_ns) - 1) * 1e-9
+    if 0.0 < step < FASTEST_S and mean < 100.0 * FASTEST_S:
         got = f"a sample every {step:.3g} s"
         expected = f"a rate of {1e-3 / FASTEST_S:g} kHz at most"
         raise place.error(None, "time", got, expected, _unit_hint(place, 's", or "ms'))

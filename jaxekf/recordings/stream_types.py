@@ -331,6 +331,8 @@ class Encoder(_Stream):
     """(N,) samples on which an estimate is judged."""
     position: Floats | None = None
     """(N, 3) metres: position of the body's origin in the reference frame."""
+    latency_ns: int = 0
+    """Time from a sample, on the IMU's clock, to its stamp."""
 
     per_sample: ClassVar = ("q_ref_body", "valid", "scored", "position")
 

@@ -1,5 +1,7 @@
 """Truth at other times than it was recorded at; nothing is invented in gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Slerp
@@ -14,6 +16,7 @@ def encoder_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1) -> 
     Outside the recorded span, and inside gaps longer than `longest_gap_s`, the result is not valid:
     interpolation never invents truth.
     """
+    encoder = _as_taken(encoder)
     kept = np.flatnonzero(encoder.valid)
     if kept.size < 2:
         unknown = np.tile([1.0, 0.0, 0.0, 0.0], (len(time_ns), 1))
@@ -45,6 +48,7 @@ def encoder_rate_at(encoder: Encoder, time_ns: Times, longest_gap_s: float = 0.1
     Central differences of the encoder's attitude, interpolated linearly, neither of them over gaps
     longer than `longest_gap_s`.
     """
+    encoder = _as_taken(encoder)
     if len(encoder.time_ns) < 3:
         return np.full((len(time_ns), 3), np.nan)
     before, after = to_scipy(encoder.q_ref_body[:-2]), to_scipy(encoder.q_ref_body[2:])
@@ -56,10 +60,18 @@ def encoder_velocity_at(encoder: Encoder, time_ns: Times, longest_gap_s: float =
 
     Central differences of the encoder's position; gaps as in `encoder_rate_at`.
     """
+    encoder = _as_taken(encoder)
     if len(encoder.time_ns) < 3 or encoder.position is None:
         return np.full((len(time_ns), 3), np.nan)
     moved = encoder.position[2:] - encoder.position[:-2]
     return _per_second(moved, encoder, time_ns, longest_gap_s)
+
+
+def _as_taken(encoder: Encoder) -> Encoder:
+    """The encoder with the times at which its samples were taken as its stamps."""
+    if encoder.latency_ns == 0:
+        return encoder
+    return replace(encoder, time_ns=encoder.time_ns - encoder.latency_ns, latency_ns=0)
 
 
 def _per_second(change: Floats, encoder: Encoder, time_ns: Times, longest_gap_s: float) -> Floats:

@@ -31,6 +31,19 @@ class Innovations(Struct):
     """By sensor."""
 
 
+class ClockOfTimes(Struct):
+    """The clock of all times of a result, and how the IMU's clock differs from the tracker's."""
+
+    name: str
+    """``imu``, ``tracker``, or ``recording`` where no two clocks differ."""
+    offset_s: float = 0.0
+    """IMU's clock minus the tracker's at `start_ns`, s."""
+    drift: float = 0.0
+    """Growth of the offset, s per s."""
+    start_ns: int = 0
+    """Start of the estimate on the tracker's clock, ns."""
+
+
 class ScoreNumbers(Struct):
     """Agreement with the encoder, as `jaxekf.score`; None is not known."""
 
@@ -40,6 +53,11 @@ class ScoreNumbers(Struct):
     position_rmse_mm: float | None
     position_nees: float | None
     samples: int
+    time_shift_s: float | None = None
+    time_shift_sigma_s: float | None = None
+    shifted_rmse_deg: float | None = None
+    rate_shift_s: float | None = None
+    rate_shift_sigma_s: float | None = None
 
 
 class SquaresTest(Struct):
@@ -89,6 +107,7 @@ class ResultDocument(Document, kw_only=True):
     model: str
     smoothed: bool
     online: bool = False
+    clock: ClockOfTimes = field(default_factory=lambda: ClockOfTimes("recording"))
     instants: int | None = None
     requested: int | None = None
     duration_s: float

@@ -21,7 +21,7 @@ from jaxekf.io.csv_table import (
     stamps,
     whole_or_blank,
 )
-from jaxekf.io.schema import FLAG, Field, Option, StreamSchema, attitude, validity
+from jaxekf.io.schema import FLAG, Field, Option, StreamSchema, attitude, latency, validity
 from jaxekf.recordings import facts, screening
 from jaxekf.recordings.accounts import Intake, Place
 from jaxekf.recordings.types import Encoder, Floats, from_scipy, to_scipy
@@ -54,7 +54,13 @@ def _read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
         origin = facts.finite_vector(origin, 3, place, "encoder.p_optical_encoder")
         position = frame.apply(length * whole_or_blank(table, POSITION)) + origin
     stream, account = screening.encoder(
-        table.place, stamps(table), q, position, scored=scored, sort=source.sort
+        table.place,
+        stamps(table),
+        q,
+        position,
+        scored=scored,
+        sort=source.sort,
+        latency_ns=description.latency_ns(about, "encoder", place),
     )
     if "q_optical_encoder" not in about:
         # Not even turned by nothing, which would round it.
@@ -102,6 +108,7 @@ def _write(stream: Encoder, about: dict[str, Any]) -> tuple[Sheet, dict[str, Any
         about |= {"kind": "attitude", "unit": unit} | dict(SCHEMA.described)
     if not stream.scored.all():
         columns, values = [*columns, "scored"], np.c_[values, stream.scored.astype(float)]
+    about |= description.latency_entry(stream.latency_ns)
     return Sheet(columns, stream.time_ns, values), about
 
 
@@ -130,6 +137,7 @@ def _screen(place: Place, arrays: Mapping[str, Any], sort: bool) -> tuple[Encode
         scored=arrays.get("scored"),
         hidden=~arrays["valid"] if "valid" in arrays else None,
         sort=sort,
+        latency_ns=int(arrays.get("latency_ns", 0)),
     )
 
 
@@ -154,6 +162,7 @@ SCHEMA = StreamSchema(
             columns=POSITION,
             about="position of the body's origin, in the encoder's frame",
         ),
+        "latency_ns": latency(),
     },
     options={
         "axis": Option("[x, y, z]", "axis of the joint, for the column `angle`", held=False),

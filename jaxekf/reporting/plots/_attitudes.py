@@ -84,7 +84,7 @@ def attitude_vector(
 ) -> Vector:
     """Roll, pitch and yaw in degrees; errors as rotation vectors in the body frame."""
     output, t = estimate.outputs["attitude"], estimate.time
-    angles, known = euler_deg(output.value), truth(recording, estimate.time_ns)
+    angles, known = euler_deg(output.value), truth(recording, estimate, estimate.time_ns)
     true = error = measured = None
     if known is not None:
         true = same_turn(known.q_ref_body, t, t, angles)
@@ -92,7 +92,7 @@ def attitude_vector(
         error = _error_deg(known, output.value)
     if poses is not None:
         raw = poses.pose.q_ref_body[poses.seen]
-        there = truth(recording, poses.pose.time_ns[poses.seen])
+        there = truth(recording, estimate, poses.pose.time_ns[poses.seen])
         off = None if there is None else _error_deg(there, raw)
         measured = Measured(poses.t, same_turn(raw, poses.t, t, angles), off, poses.label)
     sigma, error_sigma = euler_sigma_deg(output.value, output.cov), np.rad2deg(output.sigma)
@@ -128,7 +128,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
     dense = dense[_within(seconds(dense, estimate), (max(window[0], 0.0), window[1]))]
     t_held, held = seconds(dense, estimate), hold_last(poses.pose, dense)
     near = _within(estimate.time, window)
-    known = truth(recording, estimate.time_ns)
+    known = truth(recording, estimate, estimate.time_ns)
     with styled():
         drawn, grid = new_grid(3, 1 if known is None else 2, (11, 6.5), sharex=True)
         t, estimated = estimate.time[near], estimate.attitude.value[near]
@@ -148,7 +148,9 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
             axes.set_ylabel(f"{name} (deg)")
             axes.set_xlim(*window)
         if known is not None:
-            hold_error = _error_deg(encoder_at(recording.need_encoder(), dense), held)
+            hold_error = _error_deg(
+                encoder_at(recording.need_encoder(), estimate.clock.to_imu(dense)), held
+            )
             error = _error_deg(known, estimate.attitude.value)[near]
             sigma = np.rad2deg(estimate.attitude.sigma[near])
             for i, axes in enumerate(grid[:, 1]):
@@ -158,7 +160,7 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
                 axes.set_ylabel(f"error about {AXES[i]} (deg)")
                 _annotate_worst(axes, hold_error[:, i])
         title = f"{estimate.run}: no {_POSE[poses.label]} for {span[1] - span[0]:.2f} s"
-        finish(drawn, grid, title)
+        finish(drawn, grid, title, estimate.clock)
     return drawn
 
 

@@ -63,7 +63,7 @@ def bias(estimate: Estimate, recording: Recording) -> Figure:
                 _draw(axes, estimate.time, force.value[:, i], force.sigma[:, i])
                 axes.set_ylabel(f"accelerometer bias {axis} (m/s²)")
         title = "gyroscope and accelerometer bias" if has_force else "gyroscope bias"
-        finish(drawn, grid, f"{estimate.run}: {title}, body frame")
+        finish(drawn, grid, f"{estimate.run}: {title}, body frame", estimate.clock)
     return drawn
 
 
@@ -72,8 +72,9 @@ def encoder_bias(estimate: Estimated, recording: Recording) -> EncoderBias | Non
     if recording.encoder is None:
         return None
     imu = recording.need_imu()
-    inside = (imu.time_ns >= estimate.time_ns[0]) & (imu.time_ns <= estimate.time_ns[-1])
-    t = seconds(imu.time_ns[inside], estimate)
+    taken = estimate.clock.from_imu(imu.time_ns)
+    inside = (taken >= estimate.time_ns[0]) & (taken <= estimate.time_ns[-1])
+    t = seconds(taken[inside], estimate)
     true_rate = encoder_rate_at(recording.encoder, imu.time_ns[inside])
     difference = np.rad2deg(imu.gyroscope[inside] - true_rate)
     return EncoderBias(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))

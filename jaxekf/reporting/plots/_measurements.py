@@ -1,6 +1,7 @@
 """Poses measured by tracker or camera, and the times without one, for the figures.
 
-All times are those at which a sample was taken, as in the estimate, not those at which it arrived.
+All times are those at which a sample was taken, on the clock of the estimate, not those at which it
+arrived.
 """
 
 from dataclasses import replace
@@ -59,21 +60,21 @@ def seconds(time_ns: Times, estimate: Estimated) -> Floats:
     return (time_ns - estimate.time_ns[0]) / NANOSECONDS
 
 
-def truth(recording: Recording | None, time_ns: Times) -> Encoder | None:
-    """The encoder at some times; None without a recording or an encoder."""
+def truth(recording: Recording | None, estimate: Estimated, time_ns: Times) -> Encoder | None:
+    """The encoder at some times of the estimate's clock; None without a recording or an encoder."""
     if recording is None or recording.encoder is None:
         return None
-    return encoder_at(recording.encoder, time_ns)
+    return encoder_at(recording.encoder, estimate.clock.to_imu(time_ns))
 
 
 def pose_measurements(estimate: Estimated, recording: Recording) -> PoseMeasurements:
     """The poses of the tracker or, without a tracker, those computed from markers or images."""
     optical, markers, camera = recording.optical, recording.markers, recording.camera
     if optical is not None:
-        return _valid_poses(estimate, at_origin(optical), "tracker")
+        return _valid_poses(estimate, _placed(estimate, optical), "tracker")
     if markers is not None:
         measured = _valid_poses(
-            estimate, at_origin(pose.from_markers(markers)), "pose of the markers"
+            estimate, _placed(estimate, pose.from_markers(markers)), "pose of the markers"
         )
         blind = _gaps(measured.pose.time_ns, np.asarray(markers.usable.any(axis=1)), estimate)
         return measured._replace(blind=blind, words=("fewer than 3 markers", "no marker"))
@@ -92,8 +93,8 @@ def _valid_poses(estimate: Estimated, raw: Optical, label: str) -> PoseMeasureme
 
 def _of_images(estimate: Estimated, camera: Camera) -> PoseMeasurements:
     """The pose of each image by itself, for at most `_MOST_IMAGES` images; `lost` is by all images."""
-    raw = at_origin(pnp.as_optical(camera, _MOST_IMAGES))
-    taken = raw.time_ns
+    raw = _placed(estimate, pnp.as_optical(camera, _MOST_IMAGES))
+    taken = estimate.clock.from_tracker(camera.time_ns - camera.latency_ns)
     enough = np.asarray(camera.usable.sum(axis=1) >= pnp.FEWEST)
     return _valid_poses(estimate, raw, "pose of an image")._replace(
         t_all=seconds(taken[enough & (taken >= estimate.time_ns[0])], estimate),
@@ -111,6 +112,12 @@ def at_origin(raw: Optical) -> Optical:
         position = position - to_scipy(raw.q_ref_body).apply(raw.p_body_tool)
     taken = raw.time_ns - raw.latency_ns
     return replace(raw, time_ns=taken, position=position, p_body_tool=None, latency_ns=0)
+
+
+def _placed(estimate: Estimated, raw: Optical) -> Optical:
+    """The poses of the body's origin, on the clock of the estimate."""
+    there = at_origin(raw)
+    return replace(there, time_ns=estimate.clock.from_tracker(there.time_ns))
 
 
 def _gaps(time_ns: Times, seen: Flags, estimate: Estimated) -> list[Stretch]:

@@ -31,7 +31,10 @@ def _has_path(estimate: Estimate, recording: Recording) -> bool:
 def path(estimate: Estimate, recording: Recording) -> Figure:
     """3-D path of the body's origin or, for a model without position, of a marker of the tool, which
     rotates about the origin of the reference frame."""
-    poses, known = pose_measurements(estimate, recording), truth(recording, estimate.time_ns)
+    poses, known = (
+        pose_measurements(estimate, recording),
+        truth(recording, estimate, estimate.time_ns),
+    )
     if "position" in estimate.outputs:
         paths, subject = _origin_path(estimate, poses, known), "path of the body's origin"
     else:

@@ -64,7 +64,7 @@ def _usage(frames: Times, record: SensorRecord) -> _Usage:
 def visibility(estimate: Estimate, recording: Recording) -> Figure:
     """One line for each marker: used, refused by the gate, or hidden, with percentages."""
     markers = recording.need_markers()
-    taken = markers.time_ns - markers.latency_ns
+    taken = estimate.clock.from_tracker(markers.time_ns - markers.latency_ns)
     frames = taken[(taken >= estimate.time_ns[0]) & (taken <= estimate.time_ns[-1])]
     t, width = seconds(frames, estimate), period_ns(taken) / NANOSECONDS
     records = marker_sensors(estimate, recording)
@@ -77,7 +77,12 @@ def visibility(estimate: Estimate, recording: Recording) -> Figure:
         axes.set_ylim(len(records) - 0.45, -0.55)
         axes.set_xlim(0.0, float(estimate.time[-1]))
         axes.grid(visible=False, axis="y")
-        finish(drawn, np.array([[axes]]), f"{estimate.run}: visibility and use of each marker")
+        finish(
+            drawn,
+            np.array([[axes]]),
+            f"{estimate.run}: visibility and use of each marker",
+            estimate.clock,
+        )
     return drawn
 
 
@@ -123,7 +128,12 @@ def innovations(estimate: Estimate, recording: Recording) -> Figure:
             _nis(row[1], t, record, gate)
             row[0].set_ylabel(f"marker {name}\ninnovation (mm)")
             row[1].set_ylabel(f"marker {name}\nNIS (1)")
-        finish(drawn, grid, f"{estimate.run}: innovations of single markers, reference frame")
+        finish(
+            drawn,
+            grid,
+            f"{estimate.run}: innovations of single markers, reference frame",
+            estimate.clock,
+        )
     return drawn
 
 

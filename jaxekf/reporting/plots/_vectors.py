@@ -67,12 +67,14 @@ def rate_vector(
     encoder, imu = (None, None) if recording is None else (recording.encoder, recording.imu)
     known = measured = None
     if encoder is not None:
-        known = np.rad2deg(encoder_rate_at(encoder, estimate.time_ns))
+        at = estimate.clock.to_imu(estimate.time_ns)
+        known = np.rad2deg(encoder_rate_at(encoder, at))
     if imu is not None:
-        inside = (imu.time_ns >= estimate.time_ns[0]) & (imu.time_ns <= estimate.time_ns[-1])
-        times, gyroscope, off = imu.time_ns[inside], np.rad2deg(imu.gyroscope[inside]), None
+        times = estimate.clock.from_imu(imu.time_ns)
+        inside = (times >= estimate.time_ns[0]) & (times <= estimate.time_ns[-1])
+        times, gyroscope, off = times[inside], np.rad2deg(imu.gyroscope[inside]), None
         if encoder is not None:
-            off = gyroscope - np.rad2deg(encoder_rate_at(encoder, times))
+            off = gyroscope - np.rad2deg(encoder_rate_at(encoder, imu.time_ns[inside]))
         measured = Measured(seconds(times, estimate), gyroscope, off, "gyroscope", dots=False)
     output = estimate.outputs["rate"]
     return _vector("deg/s", np.rad2deg(output.value), np.rad2deg(output.sigma), known, measured)
@@ -85,10 +87,13 @@ def position_vector(
     measured = None
     if poses is not None and poses.pose.position is not None:
         seen = 1e3 * poses.pose.position[poses.seen]
-        there = _known_mm(truth(recording, poses.pose.time_ns[poses.seen]))
+        there = _known_mm(truth(recording, estimate, poses.pose.time_ns[poses.seen]))
         off = None if there is None else seen - there
         measured = Measured(poses.t, seen, off, poses.label)
-    output, known = estimate.outputs["position"], _known_mm(truth(recording, estimate.time_ns))
+    output, known = (
+        estimate.outputs["position"],
+        _known_mm(truth(recording, estimate, estimate.time_ns)),
+    )
     return _vector("mm", 1e3 * output.value, 1e3 * output.sigma, known, measured)
 
 
@@ -98,7 +103,8 @@ def velocity_vector(
     """Velocity of the body's origin in mm/s, which no sensor measures."""
     encoder, known = None if recording is None else recording.encoder, None
     if encoder is not None and encoder.position is not None:
-        known = 1e3 * encoder_velocity_at(encoder, estimate.time_ns)
+        at = estimate.clock.to_imu(estimate.time_ns)
+        known = 1e3 * encoder_velocity_at(encoder, at)
     output = estimate.outputs["velocity"]
     return _vector("mm/s", 1e3 * output.value, 1e3 * output.sigma, known, None)
 
@@ -173,7 +179,7 @@ def draw(
             if vector.error is not None:
                 _error(row[1], estimate, vector, vector.error[:, i], i, **error_style)
                 row[1].set_ylabel(names[1].format(AXES[i]))
-        finish(drawn, grid, title)
+        finish(drawn, grid, title, estimate.clock)
     return drawn
 
 

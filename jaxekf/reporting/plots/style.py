@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
+from jaxekf.estimation.clock import Clock
 from jaxekf.io.atomic import whole_file
 from jaxekf.recordings.types import Flags, Floats
 
@@ -74,10 +75,11 @@ def symmetric_limits(axes: Any, values: Floats) -> None:
         axes.set_ylim(-bound, bound)
 
 
-def finish(figure: Figure, grid: Any, title: str) -> None:
+def finish(figure: Figure, grid: Any, title: str, clock: Clock | None = None) -> None:
     """Add time labels below the columns, the title, and one legend of all curves at the bottom."""
+    label = "" if clock is None else clock.label
     for axes in grid[-1]:
-        axes.set_xlabel("time since the start of the estimate (s)")
+        axes.set_xlabel(f"time{label} since the start of the estimate (s)")
     named: dict[str, Any] = {}
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

@@ -102,7 +102,9 @@ def _difference(result: SavedResult, recording: Recording) -> str:
             continue
         if len(stream.time_ns) != count:
             return f"it has {len(stream.time_ns)} samples of {name}, not {count}"
-        if stream.time_ns[-1] < first or stream.time_ns[0] > last:
+        placed = result.clock.from_tracker if name == "optical" else result.clock.from_imu
+        begin, end = placed(stream.time_ns[[0, -1]]).tolist()
+        if end < first or begin > last:
             return f"its {name} was recorded at another time"
     return ""
 

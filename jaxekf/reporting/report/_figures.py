@@ -146,7 +146,8 @@ def others(compared: ComparedResult, bins: int) -> Figure | None:
 def _timed(compared: ComparedResult) -> Column:
     """A column over the whole time of the run."""
     return Column(
-        "time since the start of the estimate (s)", (0.0, float(compared.result.time[-1]))
+        f"time{compared.result.clock.label} since the start of the estimate (s)",
+        (0.0, float(compared.result.time[-1])),
     )
 
 

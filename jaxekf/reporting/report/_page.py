@@ -117,7 +117,7 @@ def _content(section: Section, number: int) -> dict[str, Any]:
         "name": section.name,
         "facts": (
             f"Model {result.model}; {result.document.duration_s:.3f} s, {len(result.time_ns)} instants;"
-            f" result in {result.folder}."
+            f" times{result.clock.label or ' as in the recording'}; result in {result.folder}."
         ),
         "verdicts": section.summary.verdicts,
         "missing": compared.missing,

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import UnsetType
+from msgspec import UnsetType, structs
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.estimation.clock import Clock
 from jaxekf.estimation.result import OutputEstimate
 from jaxekf.io.csv_table import numbers, read_table, read_times
 from jaxekf.io.documents import codec
@@ -69,6 +70,11 @@ class SavedResult:
     def time(self) -> Floats:
         """Seconds since the first instant."""
         return (self.time_ns - self.time_ns[0]) / NANOSECONDS
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the times."""
+        return Clock(**structs.asdict(self.document.clock))
 
     @property
     def diagnosis(self) -> DiagnosisDocument | None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation._excess_rotation import excess_rotation
 from jaxekf.estimation._step_layout import arrange, epochs_of, slow_sensors
 from jaxekf.estimation.output_times import OutputTimes, select_output_times
 from jaxekf.filtering.model import Model, Sensor, Start
@@ -162,7 +163,10 @@ def build(
     index = epochs_of(times, [samples[name].time_ns for name in slow])
     steps, step_times = arrange(times, index, samples, slow, start)
     if driver is not None:
-        steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
+        knots = knots_from(driver.time_ns, driver.value, start)
+        excess, beyond = excess_rotation(model.space, driver, step_times, steps.dt)
+        steps = steps._replace(knots=knots, excess=excess)
+        notes += (beyond,) if beyond else ()
     if start_sample is None:
         start_sample = Start(start, {name: first_visible(s) for name, s in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}
@@ -284,6 +288,8 @@ def _read(sensor: Sensor, recording: Recording) -> Samples:
         )
     samples = sensor.source(recording)
     mask = np.asarray(samples.mask)
+    if samples.at_limit is not None:
+        mask = mask & ~samples.at_limit.reshape(-1, *[1] * (mask.ndim - 1))
     if mask.ndim == 1:
         mask = np.repeat(mask[:, None], sensor.rows, axis=1)
     aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)

@@ -15,7 +15,7 @@ import numpy as np
 import tomli_w
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.checks import plausibility
+from jaxekf.checks import plausibility, pose_flips
 from jaxekf.io import _section_entries as section_entries
 from jaxekf.io import container, description
 from jaxekf.io.atomic import whole_folder
@@ -68,7 +68,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         made = container.load(path, sort=sort)
         made = made.replace(sources=made.sources or hashed(path))
     else:
-        made = without_repeats(_load_folder(Path(path), sort))
+        made = pose_flips.without_wrong_truth(without_repeats(_load_folder(Path(path), sort)))
     if made.info.get("trust_units") is not True:
         plausibility.require(made)
     return made

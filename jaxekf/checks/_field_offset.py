@@ -165,10 +165,10 @@ def _solved(
     solution, _, rank, _ = np.linalg.lstsq(rows, right, rcond=1e-6)
     if rank < rows.shape[1]:
         return None
-    matrix, linear, constant = parts(solution)
+    matrix, linear, constant = parts(np.asarray(solution, float))
     if np.linalg.eigvalsh(matrix).min() < 0.05:
         return None
-    centre = np.linalg.solve(matrix, linear)
+    centre = np.asarray(np.linalg.solve(matrix, linear), float)
     level = float(constant + centre @ matrix @ centre)
     return (centre, matrix / level) if level > 0.0 else None
 

@@ -163,10 +163,9 @@ def build(
     index = epochs_of(times, [samples[name].time_ns for name in slow])
     steps, step_times = arrange(times, index, samples, slow, start)
     if driver is not None:
-        knots = knots_from(driver.time_ns, driver.value, start)
-        excess, beyond = excess_rotation(model.space, driver, step_times, steps.dt)
-        steps = steps._replace(knots=knots, excess=excess)
-        notes += (beyond,) if beyond else ()
+        steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
+    excess, beyond = excess_rotation(model.space, driver, samples, step_times, steps.dt)
+    steps, notes = steps._replace(excess=excess), (*notes, *beyond)
     if start_sample is None:
         start_sample = Start(start, {name: first_visible(s) for name, s in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}

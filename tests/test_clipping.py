@@ -45,6 +45,20 @@ def test_a_clipped_gyroscope_is_named(fast, limit, words):
     assert warned(run) == ()
 
 
+@pytest.mark.parametrize("limit", [2000.0, 500.0, 137.2])
+def test_every_clipped_sample_is_found(fast, limit):
+    """Would catch a limit of whole numbers of a converter, which differ in size by one, or of rates from
+    which a bias was subtracted, missed on one side."""
+    rate, limit = fast[0].imu.gyroscope, np.deg2rad(limit)
+    step = limit / 32768.0
+    whole = np.clip(np.round(rate / step), -32768.0, 32767.0) * step
+    corrected = np.clip(rate, -limit, limit) - np.deg2rad([0.3, -0.2, 1.0])
+    beyond = (np.abs(rate) >= limit).any(axis=1)
+    for values in (whole, corrected):
+        found = clipped(values)
+        assert (found & beyond).sum() > 0.99 * beyond.sum() and (found & ~beyond).sum() < 3
+
+
 def test_rivals_of_a_limit_are_not_called_one(fast):
     """Would catch a peak, coarse numbers, held or frozen values, or a state of rest taken for a clipped
     sensor."""

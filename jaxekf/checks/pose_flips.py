@@ -67,6 +67,9 @@ def find_flips(time_ns: Times, q: Floats, imu: Imu, lag_s: float = 0.0) -> Flips
     if len(covered) < _FEWEST or len(imu.time_ns) < 2:
         return None
     t, q = t[covered], q[covered]
+    if np.abs(np.sum(q[1:] * q[:-1], axis=1)).min() > np.cos(0.5 * _LEAST):
+        # No two poses differ by as much as a contradiction.
+        return Flips(np.zeros(len(time_ns), bool), 0, np.nan, False, 0.0, [])
     measured = motion_agreement.rotation_vectors(q[:-1], q[1:])
     size = np.linalg.norm(measured, axis=1)
     turned = _turns(t, imu, measured, size)

@@ -62,7 +62,7 @@ def limits(values: Floats) -> list[Limit]:
             top = float(np.max(sign * column))
             if top > 0.0 and _is_limit(sign * column, top):
                 at = rows[values[rows, axis] == sign * top]
-                found.append(Limit(axis, sign * top, at, _noise(column, top) > _NOISE * top))
+                found.append(Limit(axis, sign * top, at, _noise(sign * column, top) > _NOISE * top))
     return found
 
 
@@ -105,7 +105,8 @@ def _noise(column: Floats, top: float) -> float:
     if len(column) < 50:
         return 0.0
     sixth = np.abs(np.diff(column, n=6)) / np.sqrt(924.0)
-    free = np.lib.stride_tricks.sliding_window_view(np.abs(column) < top, 7).all(axis=1)
+    inside = (column < top) & (column > column.min())
+    free = np.lib.stride_tricks.sliding_window_view(inside, 7).all(axis=1)
     large = free & (np.abs(column[3:-3]) > 0.1 * top)
     chosen = large if large.sum() > 20 else free
     return 1.48 * float(np.median(sixth[chosen])) if chosen.sum() > 20 else 0.0

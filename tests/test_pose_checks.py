@@ -117,6 +117,9 @@ def test_truth_that_flips_or_freezes_is_not_scored(tmp_path):
     masked = read.intake["encoder"].masked
     assert masked["flipped against the gyroscope"].count == flips.sum()
     assert masked["frozen while the IMU moves"].count == still.sum()
+    bad = with_stream(run, "encoder", q_ref_body=q)
+    stored = jaxekf.load(run_folder.save(bad, tmp_path / "run.h5"))
+    np.testing.assert_array_equal(stored.encoder.scored, read.encoder.scored)
     good = jaxekf.load(run_folder.save(run, tmp_path / "good"))
     assert good.encoder.scored.all()
 

@@ -68,7 +68,8 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         made = container.load(path, sort=sort)
         made = made.replace(sources=made.sources or hashed(path))
     else:
-        made = pose_flips.without_wrong_truth(without_repeats(_load_folder(Path(path), sort)))
+        made = without_repeats(_load_folder(Path(path), sort))
+    made = pose_flips.without_wrong_truth(made)
     if made.info.get("trust_units") is not True:
         plausibility.require(made)
     return made

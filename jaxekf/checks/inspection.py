@@ -24,6 +24,11 @@ from jaxekf.checks._camera_agreement import (
     camera_warnings,
     check_camera,
 )
+from jaxekf.checks._field_offset import field_findings
+from jaxekf.checks._held_values import held_findings
+from jaxekf.checks._pose_findings import pose_findings
+from jaxekf.checks._rotation_match import rotation_findings
+from jaxekf.checks._sensor_range import range_findings
 from jaxekf.checks.plausibility import FARTHEST_M, Evidence, check, evidence
 from jaxekf.checks.sensor_agreement import overlap_s
 from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times
@@ -37,6 +42,14 @@ _EXPECTED = ("blank", "hidden", "missing tool", "status ")
 _LAYOUT = ("cells are separated", "numbers have decimal commas")
 """Reasons that occur in good recordings, too: the tool was hidden."""
 
+SENSOR_CHECKS = (
+    range_findings,
+    rotation_findings,
+    pose_findings,
+    held_findings,
+    field_findings,
+)
+"""Checks that find faults of a sensor; each takes the run and the evidence to `Findings`."""
 Span = tuple[float, float]
 
 
@@ -158,6 +171,9 @@ def inspect(recording: Recording) -> Inspection:
     warnings += [] if aligned is None else _clock_warnings(aligned)
     warnings += [] if faults else _unit_warnings(recording, found)
     warnings += [] if faults or images is None else camera_warnings(images)
+    for more in (measure(recording, found) for measure in SENSOR_CHECKS):
+        warnings += more.warnings
+        notes += more.notes
     return Inspection(
         recording.name,
         streams,

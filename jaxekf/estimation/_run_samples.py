@@ -26,6 +26,8 @@ def read_sensor(sensor: Sensor, recording: Recording) -> Samples:
         )
     samples = sensor.source(recording)
     mask = np.asarray(samples.mask)
+    if samples.at_limit is not None:
+        mask = mask & ~samples.at_limit.reshape(-1, *[1] * (mask.ndim - 1))
     if mask.ndim == 1:
         mask = np.repeat(mask[:, None], sensor.rows, axis=1)
     aux = jax.tree.map(lambda a: _inert_aux(sensor.name, a, mask, recording), samples.aux)

@@ -38,6 +38,9 @@ def stack(timelines: Sequence[Timeline], epochs: int = 0, knots: int = 0) -> Ste
     substeps = max(steps.dt.shape[1] for steps in all_steps)
     knots = max(knots, *(_knot_count(steps) for steps in all_steps))
     padded = [pad(steps, epochs, substeps, knots) for steps in all_steps]
+    added = [steps.excess.shape[-1] for steps in padded if steps.excess is not None]
+    if added:
+        padded = [_with_excess(steps, added[0]) for steps in padded]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
 
 
@@ -110,6 +113,16 @@ def pad(steps: Steps, epochs: int, substeps: int, knots: int | None = None) -> S
         _pad_knots(steps.knots, knots or 0),
         {name: rows(sensor, 2) for name, sensor in steps.fast.items()},
         {name: rows(sensor, 1) for name, sensor in steps.slow.items()},
+        None if steps.excess is None else widen(steps.excess, 0.0, 2),
+    )
+
+
+def _with_excess(steps: Steps, size: int) -> Steps:
+    """Steps that add a variance to each of `size` errors, 0 where they added none."""
+    return (
+        steps
+        if steps.excess is not None
+        else steps._replace(excess=np.zeros((*steps.dt.shape, size)))
     )
 
 

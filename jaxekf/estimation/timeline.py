@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.estimation._excess_rotation import excess_rotation
 from jaxekf.estimation._run_samples import check_input, extrapolation_notes, read_sensor
 from jaxekf.estimation._step_layout import arrange, epochs_of, slow_sensors
 from jaxekf.estimation.clock import Clock
@@ -160,7 +161,7 @@ def build(
     if model.hold_to is not None:
         samples = hold(samples, model.hold_to, account)
     events = [stream.time_ns for stream in samples.values()]
-    exact = None
+    exact = placed = None
     if driver is not None:
         placed = clock.tracker_from_imu(driver.time_ns)
         inside = (placed >= start) & (placed <= end)
@@ -194,6 +195,9 @@ def build(
     steps, step_times = arrange(times, index, samples, slow, start)
     if driver is not None:
         steps = steps._replace(knots=knots_from(driver.time_ns, driver.value, start))
+    rate = None if driver is None else replace(driver, time_ns=placed)
+    excess, beyond = excess_rotation(model.space, rate, samples, step_times, steps.dt)
+    steps, notes = steps._replace(excess=excess), (*notes, *beyond)
     if start_sample is None:
         start_sample = Start(start, {name: first_visible(s) for name, s in samples.items()})
     latency = {name: stream.latency_ns for name, stream in samples.items()}

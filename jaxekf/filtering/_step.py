@@ -20,6 +20,7 @@ from jaxekf.filtering._covariance_update import MeasurementRows, UpdateAccumulat
 from jaxekf.filtering._gating import GatingResult, LinearisedRows
 from jaxekf.filtering._lowered_model import BoundModel, LoweredModel, LoweredSensor
 from jaxekf.filtering.lowering import structured_matrix
+from jaxekf.filtering.lowering.batched_products import diagonal_matrix
 from jaxekf.filtering.lowering.structured_matrix import Bands, Pattern
 from jaxekf.filtering.model import Belief
 from jaxekf.filtering.steps import Rows
@@ -33,6 +34,8 @@ class SubstepInput(NamedTuple):
     """(lanes,) seconds."""
     u: Any
     """`InputSample`, or None for a model without input."""
+    excess: Array | None = None
+    """(n, lanes) as in `Steps`."""
 
 
 class FilterCarry(NamedTuple):
@@ -82,6 +85,8 @@ def predict(bound: BoundModel, belief: Belief, inputs: SubstepInput) -> Belief:
     cov = covariance_prediction.predicted_covariance(
         patterns, f, g, belief.cov, sigma, adjoint=bound.adjoint
     )
+    if inputs.excess is not None:
+        cov = cov + diagonal_matrix(inputs.excess)
     return Belief(mean, cov)
 
 

@@ -329,7 +329,7 @@ def lower_model(
             " each; leave out runs without data"
         )
     u = jax.vmap(partial(inputs_of, model))(params, steps)
-    inputs = ScanInputs(SubstepInput(steps.dt, u), steps.fast, steps.slow)
+    inputs = ScanInputs(SubstepInput(steps.dt, u, steps.excess), steps.fast, steps.slow)
     return *lower_for_inputs(model, params, belief, inputs, AT_ESTIMATE, relinearise), inputs
 
 

@@ -29,7 +29,7 @@ from jaxekf.filtering._lowered_model import ABOUT_PATH, BoundModel, LoweredModel
 from jaxekf.filtering._smoother_pass import Information
 from jaxekf.filtering._step import SubstepInput
 from jaxekf.filtering.lowering import structured_matrix
-from jaxekf.filtering.lowering.batched_products import congruence, multiply_vector
+from jaxekf.filtering.lowering.batched_products import congruence, diagonal_matrix, multiply_vector
 from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp
 from jaxekf.filtering.lowering.lanes import materialise
 from jaxekf.filtering.lowering.reverse_only import reverse_only
@@ -219,7 +219,7 @@ def _used_inputs(first: SmootherOutput, steps: Steps) -> ScanInputs:
     def mask_unused(sensors: Any) -> Any:
         return {name: rows._replace(mask=used[name].used) for name, rows in sensors.items()}
 
-    own = SubstepInput(steps.dt, first.filtered.inputs)
+    own = SubstepInput(steps.dt, first.filtered.inputs, steps.excess)
     return ScanInputs(own, mask_unused(steps.fast), mask_unused(steps.slow))
 
 
@@ -288,6 +288,8 @@ def _filter_substep(
     back = materialise(structured_matrix.multiply(transition.g_pattern, g, own.noise))
     patterns = (transition.f_pattern, transition.g_pattern)
     cov = covariance_prediction.predicted_covariance(patterns, f, g, cov, sigma)
+    if own.substep.excess is not None:
+        cov = cov + diagonal_matrix(own.substep.excess)
     prior = UpdateAccumulator(cov, defect + forth - back, jnp.zeros_like(delta[0]))
     accumulator = prior
     linear = step.linearise(bound, own.after, own.substep.u, samples)

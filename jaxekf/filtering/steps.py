@@ -87,3 +87,6 @@ class Steps(NamedTuple):
     """Sensors sampled at substeps, leading axes (K, S)."""
     slow: dict[str, Rows]
     """Sensors sampled at the end of epochs, leading axis (K,)."""
+    excess: Any = None
+    """(K, S, n) variances that a substep adds to those of the error vector, beside the process noise: of
+    the rotation that an input at the limit of its range does not contain. None for a run without."""

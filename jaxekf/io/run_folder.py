@@ -15,7 +15,7 @@ import numpy as np
 import tomli_w
 
 from jaxekf._support.errors import RecordingError
-from jaxekf.checks import plausibility
+from jaxekf.checks import plausibility, pose_flips
 from jaxekf.io import _section_entries as section_entries
 from jaxekf.io import _stamp_repair as stamp_repair
 from jaxekf.io import container, description
@@ -70,6 +70,7 @@ def load(path: Path | str, *, sort: bool = False) -> Recording:
         made = made.replace(sources=made.sources or hashed(path))
     else:
         made = without_repeats(_load_folder(Path(path), sort))
+    made = pose_flips.without_wrong_truth(made)
     if made.info.get("trust_units") is not True:
         plausibility.require(made)
     return made

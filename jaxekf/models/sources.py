@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
+from jaxekf.recordings.clipping import clipped
 from jaxekf.recordings.types import Floats, Markers, Optical, Recording, Samples, to_scipy
 
 
@@ -38,7 +39,8 @@ def gyroscope(recording: Recording) -> Samples:
     """The gyroscope's rate (N, 3), rad/s, body frame; samples that are not finite are masked."""
     imu = recording.need_imu()
     finite = np.asarray(np.isfinite(imu.gyroscope).all(axis=1))
-    return Samples(imu.time_ns, imu.gyroscope, finite, origin=("imu",))
+    beyond = clipped(imu.gyroscope)
+    return Samples(imu.time_ns, imu.gyroscope, finite, origin=("imu",), at_limit=beyond)
 
 
 def imu(recording: Recording) -> Samples:
@@ -53,7 +55,8 @@ def imu(recording: Recording) -> Samples:
         )
     both = np.concatenate([stream.gyroscope, stream.accelerometer], axis=1)
     finite = np.asarray(np.isfinite(both).all(axis=1))
-    return Samples(stream.time_ns, both, finite, origin=("imu",))
+    beyond = clipped(stream.gyroscope)
+    return Samples(stream.time_ns, both, finite, origin=("imu",), at_limit=beyond)
 
 
 def tracked_position(optical: Optical, recording: Recording) -> Floats:

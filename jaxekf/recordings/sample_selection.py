@@ -94,6 +94,7 @@ def take(samples: Samples, chosen: NDArray[Any]) -> Samples:
         mask=samples.mask[chosen],
         aux=pick(samples.aux),
         points=pick(samples.points),
+        at_limit=pick(samples.at_limit),
     )
 
 

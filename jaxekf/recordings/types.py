@@ -86,6 +86,9 @@ class Samples:
     points: Times | None = None
     """(N,) where a sample is made of like groups, such as the points of an image: how many of them the
     source has; the account counts these. None where a sample is one row of the source."""
+    at_limit: Flags | None = None
+    """(N,) where the sensor is at the limit of its range, so that the true value may be larger. As input
+    such a sample is used with the noise of an unknown rotation, as a measurement it is masked."""
     copies: int = 1
     """Groups in a sample, those included that only fill it up."""
 

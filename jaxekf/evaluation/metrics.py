@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support import arrays
 from jaxekf.estimation.result import Estimated
 from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
 from jaxekf.recordings.types import Floats, Optical, Recording, Times, to_scipy
@@ -162,6 +163,11 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
+    arrays.need(recording, Recording, "recording", "jaxekf.load(path)")
+    if not hasattr(estimate, "outputs"):
+        got = f"a value of type {type(estimate).__name__}"
+        raise arrays.argument("estimate")(got, "an estimate", "the result of jaxekf.estimate")
+    burn_in_s = arrays.number(burn_in_s, arrays.argument("burn_in_s"))
     judged = encoder_at(recording.need_encoder(), estimate.time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)
     errors = scored_errors(estimate, recording)

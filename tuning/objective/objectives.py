@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.errors import TuningError
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import evaluate_outputs, sharing_devices
-from jaxekf.filtering import ekf
+from jaxekf.filtering import arguments, ekf
 from jaxekf.filtering.model import Belief, Model, Parameters
 from jaxekf.filtering.smoother import run_smoother_batch
 from jaxekf.geometry import manifold
@@ -188,6 +189,8 @@ def evaluate(
         If `data` is one group of several, those of `count` over all groups: the values of the groups
         then add up to that of all.
     """
+    require_float64()
+    params = arguments.parameters(model, params, check_shapes=False)
     return evaluate_each(model, objective, shared(params, data), data, counts)
 
 

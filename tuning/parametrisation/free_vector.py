@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import as_arrays, leaf_names, leaves_by_name
+from jaxekf.estimation.parameters import as_arrays, for_model, leaf_names, leaves_by_name
+from jaxekf.filtering import arguments
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Floats
 from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
@@ -302,6 +303,7 @@ def layout(
     parameters of their own. Raises `TuningError` for an unknown name, a start outside its domain or
     bounds, and an invalid prior or bounds.
     """
+    params = arguments.parameters(model, params, check_shapes=False)
     values = leaves_by_name(params)
     units = leaves_by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
     wanted = ["noise"] if free is None else list(free)
@@ -388,6 +390,7 @@ def with_axes(
     """
     if axes not in AXES:
         raise TuningError(f"got axes '{axes}', expected one of {AXES}; choose one")
+    params = arguments.parameters(model, params, check_shapes=False)
 
     def reshape(value: Any, dim: int) -> Any:
         value = np.asarray(value, float)
@@ -416,7 +419,7 @@ def initial_parameters(
     axes: str | None,
 ) -> Parameters:
     """Parameters to start a search from, in the shapes that it keeps."""
-    base = as_arrays(model.parameters if start is None else start)
+    base = for_model(model, model.parameters if start is None else start)
     if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
         base = base._replace(truth=no_correction())
     return base if axes is None else with_axes(model, base, axes, free)
@@ -430,6 +433,6 @@ def scaled(params: Parameters, factor: float) -> Parameters:
     """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales."""
     root = np.sqrt(factor)
     return params._replace(
-        noise=jax.tree.map(lambda a: a * root, params.noise),
-        initial=jax.tree.map(lambda a: a * root, params.initial),
+        noise=jax.tree.map(lambda a: a * root, arguments.float_leaves("noise", params.noise)),
+        initial=jax.tree.map(lambda a: a * root, arguments.float_leaves("initial", params.initial)),
     )

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support import compilation
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.pose_solvers import accelerometer_array
 from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray
@@ -252,6 +253,7 @@ def array_rate(
     initial rate and a random walk (`rate_walk`). The rate is early by half an interval, as the backward
     difference of eq. 3 takes the angular acceleration at a sample for that of the previous interval.
     """
+    require_float64()
     sigma, interval = grade.acceleration_sigma, 1.0 / grade.hertz
     return np.asarray(_rates(array, sigma, readings, interval, forget_s))
 

@@ -20,6 +20,7 @@ from jaxekf.cli import main
 from jaxekf.estimation import parameters
 from jaxekf.io.importers import adis
 from jaxekf.recordings.types import Imu, Recording, from_scipy, to_scipy
+from jaxekf.reporting.plots.deviations import allan as draw
 from jaxekf.simulation import attitude_runs, marker_runs
 
 PERIOD_S = 0.01
@@ -236,7 +237,7 @@ def test_command_takes_a_plain_log(tool, tmp_path):
     log = tmp_path / "lying" / "imu.csv"
     result = call("allan", log, "--from", 2, "--to", 12, "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    assert "static from 2.0 to 12.0 s, 5001 samples" in result.output
+    assert "static from 2.0 to 12.0 s of 20.0 s, 5001 samples" in result.output
     assert "Gyroscope at rest" in result.output and "below" in result.output
     short = call("allan", log, "--to", 1, "-o", tmp_path / "other")
     assert short.exit_code == 1 and "at rest, without gaps" in short.output
@@ -282,3 +283,19 @@ def test_constant_output_is_no_noise():
     start = start_for(jaxekf.get_model("loose"), static_noise(stuck))
     assert start.taken == ()
     assert "gyroscope is zero" in start.sentences[0]
+
+
+def test_the_figure_of_constant_output_does_not_warn():
+    """A logarithmic axis without a positive value, of which matplotlib warns (and warnings are errors)."""
+    imu = still(3, duration_s=10.0).need_imu()
+    stuck = Recording("stuck", imu=replace(imu, gyroscope=np.zeros_like(imu.gyroscope)))
+    assert draw(static_noise(stuck)).axes[0].get_yscale() == "linear"
+
+
+def test_the_part_of_a_log_is_stated(tmp_path):
+    """A user who takes the numbers for those of the whole log."""
+    run = still(4, duration_s=16.0, motion=attitude_runs.free_motion(4, rest_s=8.0))
+    result = call("allan", jaxekf.save(run, tmp_path / "run"), "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert " s of 16.0 s, " in result.output
+    assert "the rest at the start: --from and --to choose another" in result.output

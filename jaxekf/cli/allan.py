@@ -31,6 +31,7 @@ from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.hashes import inputs_of
 from jaxekf.io.run_folder import read_log
 from jaxekf.models import get_model
+from jaxekf.recordings.types import NANOSECONDS
 from jaxekf.reporting.plots.deviations import allan as draw
 from jaxekf.reporting.plots.style import save
 
@@ -73,9 +74,14 @@ def allan(
     recording = read_log(log)
     noise = static_noise(recording, begin_s, end_s)
     start = start_for(chosen, noise)
-    note(
-        f"{noise.run}: static from {noise.begin_s:.1f} to {noise.end_s:.1f} s, {noise.imu.samples} samples"
+    times = recording.need_imu().time_ns
+    whole = float(times[-1] - times[0]) / NANOSECONDS
+    part = f"{noise.begin_s:.1f} to {noise.end_s:.1f} s of {whole:.1f} s"
+    chosen_by = (
+        "" if begin_s or end_s else ", the rest at the start: --from and --to choose another"
     )
+    chosen_by = "" if noise.end_s > whole - 0.1 else chosen_by
+    note(f"{noise.run}: static from {part}, {noise.imu.samples} samples{chosen_by}")
     if noise.imu.missing:
         note(f"{noise.run}: {noise.imu.missing} missing samples were interpolated")
     for text in start.sentences:

@@ -12,12 +12,16 @@ from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from jaxekf.cli.commands import WRITTEN
 from jaxekf.io.description import SCHEMA_VERSION
 from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
 from jaxekf.models.robust import OUTLIER_METHODS
+
+_UNLIMITED = 100_000
+"""Width of what is not a terminal."""
 
 
 def default_option(name: str, kind: Any, default: Any, contents: str) -> Callable[[Any], Any]:
@@ -82,15 +86,64 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print a table on standard output; numbers are right-aligned, NaN is a dash."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    for i, column in enumerate(columns):
-        numeric = bool(rows) and isinstance(rows[0][i], float | int)
-        table.add_column(column, justify="right" if numeric else "left", no_wrap=True)
+    """Print a table on standard output; numbers are right-aligned, NaN is a dash.
+
+    No cell is ever shortened. In a terminal that is too narrow the heads take more lines, rows become
+    columns, or each row becomes a block of lines ``name: value``. A pipe or file has no width.
+    """
+    shown = [[_cell(value) for value in row] for row in rows]
+    numeric = [bool(rows) and isinstance(value, float | int) for value in (rows or [columns])[0]]
+    width = _terminal_width()
+    for table in _forms(columns, shown, numeric):
+        table_width = Console(width=_UNLIMITED).measure(table).maximum
+        if table_width <= width:
+            console = Console(width=table_width)
+            # In full, also where it is wider than the table.
+            console.print(title, style="bold", soft_wrap=True, markup=False, highlight=False)
+            console.print(table)
+            return
+    _print_blocks(title, columns, shown)
+
+
+def _forms(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[bool]
+) -> Iterator[Table]:
+    """The same table in forms that are narrower and narrower."""
+    folded = [column.replace(" ", "\n") for column in columns]
+    yield _table(columns, rows, numeric)
+    yield _table(folded, rows, numeric)
+    yield _table(folded, rows, numeric, padding=(0, 0))
+    turned = [[" ".join(n.split()), *cells] for n, *cells in zip(columns, *rows, strict=True)]
+    yield _table(turned[0], turned[1:], [False, *len(rows) * [True]])
+
+
+def _table(
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[bool],
+    padding: tuple[int, int] = (0, 1),
+) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=padding)
+    for head, right in zip(heads, numeric, strict=True):
+        table.add_column(Text(head), justify="right" if right else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*[_cell(value) for value in row])
-    wide = None if sys.stdout.isatty() else 120
-    Console(width=wide).print(table)
+        table.add_row(*map(Text, row))  # a text in brackets is no style
+    return table
+
+
+def _print_blocks(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Each row as lines ``name: value`` below its first cell."""
+    click.secho(title, bold=True)
+    for row in rows:
+        click.echo(f"\n  {row[0]}")
+        for name, cell in zip(columns[1:], row[1:], strict=True):
+            click.echo(f"    {' '.join(name.split())}: {cell}")
+    click.echo()
+
+
+def _terminal_width() -> int:
+    """Columns of the terminal; unlimited in a pipe or file."""
+    return Console().width if sys.stdout.isatty() else _UNLIMITED
 
 
 def _cell(value: Any) -> str:

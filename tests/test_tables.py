@@ -1,8 +1,11 @@
 """Tables of the command line: every number whole at every width."""
 
 import re
+from types import SimpleNamespace
 
+import click
 import pytest
+from click.testing import CliRunner
 
 from jaxekf.cli import console
 
@@ -76,3 +79,29 @@ def test_brackets_are_no_markup(capsys, monkeypatch):
     assert "noise[red]" in text
     assert "matrix[0,1]" in text
     assert "Run [a]" in text
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_lines_where_there_is_no_bar(quiet):
+    """Would catch minutes of silence in a pipe or a log file, and lines in spite of --quiet."""
+
+    @click.command()
+    @console.quiet_option
+    def slow():
+        with console.tuning_progress(60) as bar:
+            bar.stage("fold 1/2")
+            bar.printed -= 60.0
+            bar(
+                SimpleNamespace(number=7, training=1.25, validation=float("nan"), rejected=False),
+                60,
+            )
+            bar(
+                SimpleNamespace(number=8, training=1.0, validation=float("nan"), rejected=False), 60
+            )
+
+    result = CliRunner().invoke(slow, ["--quiet"] if quiet else [])
+    assert result.exit_code == 0
+    lines = (
+        [] if quiet else ["tuning: compiling", "fold 1/2", "fold 1/2: 1.25 after iteration 7 of 60"]
+    )
+    assert result.stderr.splitlines() == lines

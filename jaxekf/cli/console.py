@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import click
@@ -20,6 +21,8 @@ from jaxekf.io.documents import codec
 from jaxekf.models import REGISTRY
 from jaxekf.models.robust import OUTLIER_METHODS
 
+_SECONDS_BETWEEN_LINES = 10.0
+"""Time between two lines on an iteration where there is no bar."""
 _UNLIMITED = 100_000
 """Width of what is not a terminal."""
 
@@ -47,6 +50,21 @@ noise_option = click.option(
     "  [default: as in the model]",
 )
 
+_QUIET = "jaxekf.quiet"
+
+
+def _be_quiet(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    ctx.meta[_QUIET] = value
+
+
+quiet_option = click.option(
+    "--quiet",
+    is_flag=True,
+    envvar="JAXEKF_QUIET",
+    expose_value=False,
+    callback=_be_quiet,
+    help="No lines on the progress, which standard error gets where it is not a terminal.",
+)
 sort_option = click.option(
     "--sort",
     is_flag=True,
@@ -76,6 +94,14 @@ def wrote(path: Path) -> None:
 def note(text: str) -> None:
     """Print a line for the user on standard error."""
     click.echo(text, err=True)
+
+
+def stage(text: str) -> None:
+    """Print what a long command does next, unless a terminal shows a bar for it, or --quiet is given."""
+    context = click.get_current_context(silent=True)
+    is_quiet = context is not None and context.meta.get(_QUIET, False)
+    if not sys.stderr.isatty() and not is_quiet:
+        note(text)
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -157,23 +183,29 @@ class TuningBar:
 
     def __init__(self, bar: Progress, iterations: int) -> None:
         self.bar, self.iterations, self.prefix = bar, iterations, "tuning"
+        self.printed = monotonic()
+        stage("tuning: compiling")
         self.task = bar.add_task("tuning: compiling", total=iterations)
 
     def __call__(self, step: Any, total: int) -> None:
         held = "" if step.validation != step.validation else f", validation {step.validation:.5g}"
         result = "rejected step" if step.rejected else f"{step.training:.5g}{held}"
         text = f"{self.prefix}: {result}"
+        if monotonic() - self.printed > _SECONDS_BETWEEN_LINES:
+            self.printed = monotonic()
+            stage(f"{text} after iteration {step.number} of {total}")
         self.bar.update(self.task, completed=step.number + 1, total=total, description=text)
 
     def stage(self, text: str) -> None:
         """Reset the bar with another description, such as ``fold 2/5``."""
         self.prefix = text
+        stage(text)
         self.bar.reset(self.task, total=self.iterations, description=text)
 
 
 @contextmanager
 def tuning_progress(iterations: int) -> Iterator[TuningBar]:
-    """A progress bar for the tuner on standard error, if that is a terminal."""
+    """A progress bar for the tuner on standard error; lines where that is no terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

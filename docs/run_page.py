@@ -25,7 +25,7 @@ def run_block(kind: str, code: str, folder: str) -> str:
     shell = f'jaxekf() {{ "{sys.executable}" -m jaxekf "$@"; }}\nset -e\n{code}'
     command = ["bash", "-c", shell] if kind == "sh" else [sys.executable, "-c", code]
     path = os.pathsep.join([str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    env = os.environ | {"PYTHONPATH": path, "TF_CPP_MIN_LOG_LEVEL": "3"}
+    env = os.environ | {"PYTHONPATH": path, "COLUMNS": "100", "TF_CPP_MIN_LOG_LEVEL": "3"}
     env |= {"JAXEKF_QUIET": "1"}  # Lines on the progress depend on the machine.
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     if done.returncode:

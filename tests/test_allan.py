@@ -298,4 +298,33 @@ def test_the_part_of_a_log_is_stated(tmp_path):
     result = call("allan", jaxekf.save(run, tmp_path / "run"), "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
     assert " s of 16.0 s, " in result.output
-    assert "the rest at the start: --from and --to choose another" in result.output
+    assert "this is the rest at the start; --from and --to choose another" in result.output
+
+
+def rest_last(head_s):
+    """A run that rests at first, moves for 8 s, and rests for 20 s."""
+    run = still(4, duration_s=28.0 + head_s, motion=attitude_runs.free_motion(4, rest_s=head_s))
+    imu = run.need_imu()
+    t = (imu.time_ns - imu.time_ns[0]) / 1e9
+    rng = np.random.default_rng(1)
+    noise = 4e-3 * rng.standard_normal(imu.gyroscope.shape)
+    rests = (t < head_s) | (t > head_s + 8.0)
+    gyroscope = np.where(rests[:, None], noise, imu.gyroscope)
+    return Recording("late", imu=replace(imu, gyroscope=gyroscope))
+
+
+def test_a_longer_rest_is_named(tmp_path):
+    """Noise of the four seconds before a motion, where the log rests for twenty after it; and a motion that
+    is named as rest."""
+    for head_s in (1.0, 5.0):
+        begin, end = static_interval.longest_rest(rest_last(head_s).imu)
+        assert head_s + 8.0 <= begin <= head_s + 9.1
+        assert end == pytest.approx(head_s + 28.0, abs=1.1)
+    begin, end = static_interval.longest_rest(still(0, rest_s=1.0).need_imu())
+    assert end - begin < 5.0
+    result = call("allan", jaxekf.save(rest_last(5.0), tmp_path / "run"), "-o", tmp_path / "out")
+    assert "this is the rest at the start; a longer one is from" in result.output
+    with pytest.raises(
+        RecordingError, match=r"try --from \S+ --to \S+, the longest rest of the run"
+    ):
+        static_interval.static_head(rest_last(1.0))

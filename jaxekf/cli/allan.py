@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxekf.calibration.allan import SensorNoise
 from jaxekf.calibration.noise_densities import Coefficient
-from jaxekf.calibration.static_interval import TrackerNoise
+from jaxekf.calibration.static_interval import TrackerNoise, longest_rest
 from jaxekf.calibration.static_noise import (
     AXES,
     as_dict,
@@ -31,7 +31,7 @@ from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.hashes import inputs_of
 from jaxekf.io.run_folder import read_log
 from jaxekf.models import get_model
-from jaxekf.recordings.types import NANOSECONDS
+from jaxekf.recordings.types import NANOSECONDS, Recording
 from jaxekf.reporting.plots.deviations import allan as draw
 from jaxekf.reporting.plots.style import save
 
@@ -77,11 +77,9 @@ def allan(
     times = recording.need_imu().time_ns
     whole = float(times[-1] - times[0]) / NANOSECONDS
     part = f"{noise.begin_s:.1f} to {noise.end_s:.1f} s of {whole:.1f} s"
-    chosen_by = (
-        "" if begin_s or end_s else ", the rest at the start: --from and --to choose another"
-    )
-    chosen_by = "" if noise.end_s > whole - 0.1 else chosen_by
-    note(f"{noise.run}: static from {part}, {noise.imu.samples} samples{chosen_by}")
+    note(f"{noise.run}: static from {part}, {noise.imu.samples} samples")
+    if begin_s is None and end_s is None:
+        _note_longer_rest(recording, noise.end_s, whole)
     if noise.imu.missing:
         note(f"{noise.run}: {noise.imu.missing} missing samples were interpolated")
     for text in start.sentences:
@@ -101,6 +99,18 @@ def allan(
     for label, sensor in noise.sensors.items():
         _print_sensor(label, sensor)
     _print_tracker(noise.tracker)
+
+
+def _note_longer_rest(recording: Recording, end_s: float, whole_s: float) -> None:
+    """Print that the rest at the start was taken, and whether the run has a longer one."""
+    if end_s > whole_s - 1.0:
+        return
+    begin, end = longest_rest(recording.need_imu())
+    if end - begin > end_s + 1.0:
+        choice = f"a longer one is from {begin:g} to {end:g} s (--from {begin:g} --to {end:g})"
+    else:
+        choice = "--from and --to choose another"
+    note(f"{recording.name}: this is the rest at the start; {choice}")
 
 
 def _print_sensor(label: str, sensor: SensorNoise) -> None:

@@ -136,20 +136,19 @@ def _calm_windows(imu: Imu) -> tuple[Floats, Floats, Flags]:
 def longest_rest(imu: Imu) -> tuple[float, float]:
     """Start and end of the longest interval in which the gyroscope is static, s after the first sample;
     equal if it never is for 3 s."""
-    calm = np.concatenate([[False], _calm_windows(imu)[2], [False]])
-    begins, ends = (
-        np.flatnonzero(np.diff(calm.astype(int)) == 1),
-        np.flatnonzero(np.diff(calm.astype(int)) == -1),
-    )
+    change = np.diff(_calm_windows(imu)[2].astype(int), prepend=0, append=0)
+    begins, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     best = (0.0, 0.0)
     for at in np.argsort(begins - ends):
         # Motion may reach into the first and last window.
-        begin, end = _WINDOW_S * (begins[at] + (begins[at] > 0)), _WINDOW_S * (ends[at] - 1)
-        if end - begin <= max(best[1] - best[0], _LEAST_HEAD_S):
+        begin = _WINDOW_S * float(begins[at] + (begins[at] > 0))
+        end = _WINDOW_S * float(ends[at] - 1)
+        least = max(best[1] - best[0], _LEAST_HEAD_S)
+        if end - begin <= least:
             break
         quiet = quiet_s(cut_imu(imu, begin, end))
-        if quiet > max(best[1] - best[0], _LEAST_HEAD_S):
-            best = (float(begin), float(begin + quiet))
+        if quiet > least:
+            best = (begin, begin + quiet)
     return best
 
 

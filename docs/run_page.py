@@ -26,6 +26,7 @@ def run_block(kind: str, code: str, folder: str) -> str:
     command = ["bash", "-c", shell] if kind == "sh" else [sys.executable, "-c", code]
     path = os.pathsep.join([str(_ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     env = os.environ | {"PYTHONPATH": path, "COLUMNS": "100", "TF_CPP_MIN_LOG_LEVEL": "3"}
+    env |= {"JAXEKF_QUIET": "1"}  # Lines on the progress depend on the machine.
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(f"{code}\nended with {done.returncode}:\n{done.stdout}{done.stderr}")

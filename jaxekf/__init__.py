@@ -11,6 +11,7 @@ from jaxekf._support.lazy import attributes, type_checked
 if TYPE_CHECKING:
     from jaxekf._support.compilation import jit, set_up
     from jaxekf._support.errors import (
+        ArgumentError,
         CacheError,
         FilterError,
         JaxekfError,
@@ -60,6 +61,7 @@ __version__ = "0.1.0"
 __all__ = [
     "SO3",
     "AdditiveQuaternion",
+    "ArgumentError",
     "Belief",
     "CacheError",
     "Camera",

@@ -20,6 +20,7 @@ from jaxekf.cli import main
 from jaxekf.estimation import parameters
 from jaxekf.io.importers import adis
 from jaxekf.recordings.types import Imu, Recording, from_scipy, to_scipy
+from jaxekf.reporting.plots.deviations import allan as draw
 from jaxekf.simulation import attitude_runs, marker_runs
 
 PERIOD_S = 0.01
@@ -236,7 +237,7 @@ def test_command_takes_a_plain_log(tool, tmp_path):
     log = tmp_path / "lying" / "imu.csv"
     result = call("allan", log, "--from", 2, "--to", 12, "-o", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    assert "static from 2.0 to 12.0 s, 5001 samples" in result.output
+    assert "static from 2.0 to 12.0 s of 20.0 s, 5001 samples" in result.output
     assert "Gyroscope at rest" in result.output and "below" in result.output
     short = call("allan", log, "--to", 1, "-o", tmp_path / "other")
     assert short.exit_code == 1 and "at rest, without gaps" in short.output
@@ -282,3 +283,48 @@ def test_constant_output_is_no_noise():
     start = start_for(jaxekf.get_model("loose"), static_noise(stuck))
     assert start.taken == ()
     assert "gyroscope is zero" in start.sentences[0]
+
+
+def test_the_figure_of_constant_output_does_not_warn():
+    """A logarithmic axis without a positive value, of which matplotlib warns (and warnings are errors)."""
+    imu = still(3, duration_s=10.0).need_imu()
+    stuck = Recording("stuck", imu=replace(imu, gyroscope=np.zeros_like(imu.gyroscope)))
+    assert draw(static_noise(stuck)).axes[0].get_yscale() == "linear"
+
+
+def test_the_part_of_a_log_is_stated(tmp_path):
+    """A user who takes the numbers for those of the whole log."""
+    run = still(4, duration_s=16.0, motion=attitude_runs.free_motion(4, rest_s=8.0))
+    result = call("allan", jaxekf.save(run, tmp_path / "run"), "-o", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert " s of 16.0 s, " in result.output
+    assert "this is the rest at the start; --from and --to choose another" in result.output
+
+
+def rest_last(head_s):
+    """A run that rests at first, moves for 8 s, and rests for 20 s."""
+    run = still(4, duration_s=28.0 + head_s, motion=attitude_runs.free_motion(4, rest_s=head_s))
+    imu = run.need_imu()
+    t = (imu.time_ns - imu.time_ns[0]) / 1e9
+    rng = np.random.default_rng(1)
+    noise = 4e-3 * rng.standard_normal(imu.gyroscope.shape)
+    rests = (t < head_s) | (t > head_s + 8.0)
+    gyroscope = np.where(rests[:, None], noise, imu.gyroscope)
+    return Recording("late", imu=replace(imu, gyroscope=gyroscope))
+
+
+def test_a_longer_rest_is_named(tmp_path):
+    """Noise of the four seconds before a motion, where the log rests for twenty after it; and a motion that
+    is named as rest."""
+    for head_s in (1.0, 5.0):
+        begin, end = static_interval.longest_rest(rest_last(head_s).imu)
+        assert head_s + 8.0 <= begin <= head_s + 9.1
+        assert end == pytest.approx(head_s + 28.0, abs=1.1)
+    begin, end = static_interval.longest_rest(still(0, rest_s=1.0).need_imu())
+    assert end - begin < 5.0
+    result = call("allan", jaxekf.save(rest_last(5.0), tmp_path / "run"), "-o", tmp_path / "out")
+    assert "this is the rest at the start; a longer one is from" in result.output
+    with pytest.raises(
+        RecordingError, match=r"try --from \S+ --to \S+, the longest rest of the run"
+    ):
+        static_interval.static_head(rest_last(1.0))

@@ -10,6 +10,7 @@ import pytest
 import scenario
 
 import jaxekf
+import tuning
 from jaxekf._support.errors import FilterError, ModelError, PrecisionError
 from jaxekf.estimation import batch, padding, timeline
 from jaxekf.estimation.parameters import as_arrays
@@ -173,8 +174,27 @@ def test_rate_covariance_holds_for_the_rate(tmp_path):
 
 def test_float32_is_refused_in_a_sentence():
     """Would catch variances that are wrong by tens of percent without a word."""
-    with jax.enable_x64(False), pytest.raises(PrecisionError, match="set_up"):
-        jaxekf.estimate(record())
+    run, model = record(), jaxekf.get_model("loose")
+    line = jaxekf.timeline.build(model, run)
+    belief = jaxekf.initial_belief(model, model.parameters, line.first)
+    given = model, model.parameters, belief, line.steps
+    for call in (
+        lambda: jaxekf.estimate(run),
+        lambda: jaxekf.estimate_online(run),
+        lambda: jaxekf.initial_belief(model, model.parameters, line.first),
+        lambda: jaxekf.run_filter(*given),
+        lambda: jaxekf.run_smoother(*given),
+        lambda: jaxekf.run_iterated_smoother(*given),
+        lambda: jaxekf.Stream(*given[:3], 0),
+        lambda: tuning.tune([run]),
+        lambda: tuning.tune_by_nelder_mead([run]),
+        lambda: tuning.prepare(model, [run]),
+        lambda: tuning.evaluate(model, tuning.attitude_error(), model.parameters, None),
+        lambda: tuning.cross_validate([run, run.replace(name="other")]),
+        lambda: attitude_runs.draw(model, given[1], belief.mean, line.steps, None),
+    ):
+        with jax.enable_x64(False), pytest.raises(PrecisionError, match="set_up"):
+            call()
 
 
 def test_broken_recursion_names_run_step_and_sensor():

@@ -117,7 +117,7 @@ def test_what_lies_outside_is_said():
         (np.array([], np.int64), "no requested times"),
         (jaxekf.every(1e-9), "no more than"),
         (np.array([1], "timedelta64[s]"), "expected int64 nanoseconds"),
-        (np.ma.array([1, 2], mask=[True, False]), "none masked"),
+        (np.ma.array([1, 2], mask=[True, False]), "without a mask"),
     ):
         with pytest.raises(RecordingError, match=words):
             jaxekf.estimate(RUN, at=bad)

@@ -300,6 +300,31 @@ def test_stamps(tmp_path):
         ros.load(path)
 
 
+def test_a_few_stamps_that_were_not_set(tmp_path):
+    """Would catch a bag of thousands of messages that is refused for one of them, or an account that loses
+    it."""
+    spoil = lambda i: {"time_ns": 0} if i in (0, 250) else {}  # noqa: E731
+    made = ros.load(imu_bag(tmp_path, 400, spoil=spoil))
+    kept = np.delete(np.arange(400), [0, 250])
+    np.testing.assert_array_equal(made.imu.time_ns, START + 5_000_000 * kept)
+    account = made.intake["imu"]
+    assert (account.rows, account.dropped["stamp of 0"].count) == (400, 2)
+    np.testing.assert_array_equal(account.dropped["stamp of 0"].numbers, [0, 250])
+    np.testing.assert_array_equal(account.numbers, kept)
+    assert "2 rows are dropped, stamp of 0" in " ".join(account.sentences("imu"))
+
+
+def test_topics_that_are_not_read(run, tmp_path):
+    """Would catch an odometry or a magnetometer that is left out in silence."""
+    make = Maker("sqlite3")
+    field = "sensor_msgs/msg/MagneticField"
+    message = make.new(field, make.header(START, "imu"), make.vector([0, 0.2, 0.4]), np.zeros(9))
+    path = write(tmp_path, "sqlite3", {**topics(run, make), "/mag": (field, [message])}, make)
+    text = " ".join(ros.load(path).info["assumptions"])
+    assert "/mag (sensor_msgs/msg/MagneticField, 1 messages) is not read" in text
+    assert "Odometry" not in text
+
+
 def test_order(tmp_path):
     """Would catch messages sorted in silence, or the wrong one named."""
     path = imu_bag(tmp_path, spoil=lambda i: {"time_ns": START + 5_000_000 * 3.5} if i == 7 else {})

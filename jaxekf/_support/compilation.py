@@ -7,6 +7,8 @@ from typing import Any
 
 import jax
 
+from jaxekf._support.errors import PrecisionError
+
 KEEPS_BARRIERS = jax.__version_info__ >= (0, 11)
 """Whether XLA on a CPU respects optimisation barriers in fusion; older versions remove them first."""
 
@@ -62,6 +64,15 @@ def set_up() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if _EXTRA not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_NO_UNROLLING}".strip()
+
+
+def require_float64() -> None:
+    """Raise `PrecisionError` if JAX is not set to float64."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise PrecisionError(
+            "got JAX in float32, expected float64; call jaxekf.set_up() before the first array, or set"
+            " JAX_ENABLE_X64=1"
+        )
 
 
 def jit(function: Callable[..., Any], **options: Any) -> Any:

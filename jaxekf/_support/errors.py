@@ -1,6 +1,7 @@
 """Errors and warnings of the package. Each message has what was got, what was expected and what to do."""
 
 from pathlib import Path
+from typing import Any
 
 
 class JaxekfError(Exception):
@@ -18,6 +19,20 @@ class JaxekfError(Exception):
     ...         print(f"{name} is left out: {type(error).__name__}")
     free-5
     free-7 is left out: RecordingError
+    """
+
+
+class ArgumentError(JaxekfError, ValueError):
+    """An argument of a function has a type, shape or value that cannot be used; the message names it.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> try:
+    ...     jaxekf.every("fast")
+    ... except jaxekf.ArgumentError as error:
+    ...     print(str(error).split("; try")[0])
+    seconds: got values of type <U4, expected real numbers
     """
 
 
@@ -52,6 +67,16 @@ class RecordingError(JaxekfError):
         message = f"{place}: got {got}, expected {expected}; try {hint}"
         # The text of a damaged file may hold any characters; the message is one printable line.
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in message))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By the message: a worker process passes its errors on.
+        return _restored, (type(self), self.args, vars(self))
+
+
+def _restored(cls: type[RecordingError], args: tuple[Any, ...], state: dict[str, Any]) -> Any:
+    error = cls.__new__(cls, *args)
+    vars(error).update(state)
+    return error
 
 
 class ModelError(JaxekfError):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxekf._support import chi_square
+from jaxekf._support import arrays, chi_square
 from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.noise_densities import Densities, fit
 from jaxekf.recordings.types import NANOSECONDS, Floats, Imu, Times, period_ns
@@ -114,6 +114,7 @@ def sensor_noise(values: Floats, period_s: float, unit: str) -> SensorNoise:
     unit
         Unit of the samples.
     """
+    values = arrays.floats(values, arrays.argument("values"), (None, 3))
     x, y, z = (fit(values[:, i], period_s) for i in range(3))
     lengths = averaging_lengths(len(values))
     tau = lengths * period_s
@@ -152,6 +153,8 @@ def overlapping_deviation(values: Floats, lengths: Floats) -> Floats:
     >>> bool(abs(deviation[0] / deviation[1] - 10.0) < 0.5)  # falls with the root of the time
     True
     """
+    values = arrays.floats(values, arrays.argument("values"), (None,))
+    lengths = arrays.floats(lengths, arrays.argument("lengths"), (None,))
     total = np.concatenate([[0.0], np.cumsum(values - np.mean(values))])
     found = np.empty(len(lengths))
     for i, m in enumerate(lengths.astype(int)):

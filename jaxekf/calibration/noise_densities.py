@@ -19,7 +19,7 @@ import numpy as np
 from scipy.fft import dst
 from scipy.optimize import brentq, nnls
 
-from jaxekf._support import chi_square
+from jaxekf._support import arrays, chi_square
 from jaxekf._support.deprecations import renamed
 from jaxekf.recordings.types import Flags, Floats
 
@@ -117,7 +117,7 @@ def fit(values: Floats, period_s: float) -> Densities:
     period_s
         Sampling period, s.
     """
-    step = np.diff(np.asarray(values, float))
+    step = np.diff(arrays.floats(values, arrays.argument("values"), (None,)))
     if not step.any():
         nothing = Coefficient(0.0, 0.0, 0.0)
         return Densities(0.0, nothing, 0.0, nothing, nothing, 0.5 / period_s)

@@ -90,11 +90,15 @@ def static_head(recording: Recording) -> float:
     imu = recording.need_imu()
     found = quiet_s(imu)
     if found < _LEAST_HEAD_S:
+        begin, end = longest_rest(imu)
+        hint = "a run that begins at rest, or --from and --to of a static interval"
+        if end > begin:
+            hint = f"--from {begin:g} --to {end:g}, the longest rest of the run"
         raise RecordingError(
             place,
             f"{found:.1f} s of rest at the start",
             f"{_LEAST_HEAD_S:.0f} s or more in which the gyroscope stays quiet",
-            "a run that begins at rest, or --from and --to of a static interval",
+            hint,
         )
     if recording.optical is not None:
         _require_no_rotation(recording.optical, imu, found, place)
@@ -103,30 +107,56 @@ def static_head(recording: Recording) -> float:
 
 def quiet_s(imu: Imu) -> float:
     """Seconds from the first sample during which the gyroscope is static; 0 if it moves from the start."""
-    t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
-    label = np.floor(t / _WINDOW_S).astype(int)
-    count = np.bincount(label).astype(float)
-    if len(count) < 2:
+    length = float(imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS
+    mean, own, quiet = _calm_windows(imu)
+    if len(mean) < 2:
         return 0.0
-    count[-1] = max(count[-1], 1.0)
-    held = np.maximum(count, 1.0)[:, None]
-    mean = np.stack([np.bincount(label, column) for column in imu.gyroscope.T], axis=1) / held
-    off = imu.gyroscope - mean[label]
-    scatter = np.sqrt(np.stack([np.bincount(label, c * c) for c in off.T], axis=1) / held)
-    own = np.quantile(scatter[:-1], _QUIETEST, axis=0) + _FLOOR
     # The reference of a window is the mean of those before it, so that motion does not change its own
     # reference, and of a limited number, so that a bias may drift over hours.
     total, row = np.cumsum(mean, axis=0), np.arange(len(mean))
     far = np.where((row >= _REMEMBERED)[:, None], total[np.maximum(row - _REMEMBERED, 0)], 0.0)
     before = (total - far) / np.minimum(row + 1, _REMEMBERED)[:, None]
-    quiet = (scatter <= _LOUDER * own).all(axis=1) & (count > 0.0)
-    quiet &= (np.abs(mean) <= _FASTEST_BIAS).all(axis=1)
     quiet[1:] &= (np.abs(mean[1:] - before[:-1]) <= own).all(axis=1)
     moving = np.flatnonzero(~quiet)
     if moving.size == 0:
-        return float(t[-1])
+        return length
     # Slow motion may have begun in the window before.
     return max(0.0, float(moving[0] - 1) * _WINDOW_S)
+
+
+def _calm_windows(imu: Imu) -> tuple[Floats, Floats, Flags]:
+    """For windows of half a second: mean rates (W, 3), the sensor's own scatter (3,), and which windows
+    (W,) have no more scatter than that, and no fast turn."""
+    t = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
+    label = np.floor(t / _WINDOW_S).astype(int)
+    count = np.bincount(label).astype(float)
+    count[-1] = max(count[-1], 1.0)
+    held = np.maximum(count, 1.0)[:, None]
+    mean = np.stack([np.bincount(label, column) for column in imu.gyroscope.T], axis=1) / held
+    off = imu.gyroscope - mean[label]
+    scatter = np.sqrt(np.stack([np.bincount(label, c * c) for c in off.T], axis=1) / held)
+    own = np.quantile(scatter[: max(len(scatter) - 1, 1)], _QUIETEST, axis=0) + _FLOOR
+    calm = (scatter <= _LOUDER * own).all(axis=1) & (count > 0.0)
+    return mean, own, calm & (np.abs(mean) <= _FASTEST_BIAS).all(axis=1)
+
+
+def longest_rest(imu: Imu) -> tuple[float, float]:
+    """Start and end of the longest interval in which the gyroscope is static, s after the first sample;
+    equal if it never is for 3 s."""
+    change = np.diff(_calm_windows(imu)[2].astype(int), prepend=0, append=0)
+    begins, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    best = (0.0, 0.0)
+    for at in np.argsort(begins - ends):
+        # Motion may reach into the first and last window.
+        begin = _WINDOW_S * float(begins[at] + (begins[at] > 0))
+        end = _WINDOW_S * float(ends[at] - 1)
+        least = max(best[1] - best[0], _LEAST_HEAD_S)
+        if end - begin <= least:
+            break
+        quiet = quiet_s(cut_imu(imu, begin, end))
+        if quiet > least:
+            best = (begin, begin + quiet)
+    return best
 
 
 def cut_imu(imu: Imu, begin_s: float, end_s: float) -> Imu:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxekf.calibration.allan import SensorNoise
 from jaxekf.calibration.noise_densities import Coefficient
-from jaxekf.calibration.static_interval import TrackerNoise
+from jaxekf.calibration.static_interval import TrackerNoise, longest_rest
 from jaxekf.calibration.static_noise import (
     AXES,
     as_dict,
@@ -31,6 +31,7 @@ from jaxekf.io.atomic import check_output, whole_folder
 from jaxekf.io.hashes import inputs_of
 from jaxekf.io.run_folder import read_log
 from jaxekf.models import get_model
+from jaxekf.recordings.types import NANOSECONDS, Recording
 from jaxekf.reporting.plots.deviations import allan as draw
 from jaxekf.reporting.plots.style import save
 
@@ -73,9 +74,12 @@ def allan(
     recording = read_log(log)
     noise = static_noise(recording, begin_s, end_s)
     start = start_for(chosen, noise)
-    note(
-        f"{noise.run}: static from {noise.begin_s:.1f} to {noise.end_s:.1f} s, {noise.imu.samples} samples"
-    )
+    times = recording.need_imu().time_ns
+    whole = float(times[-1] - times[0]) / NANOSECONDS
+    part = f"{noise.begin_s:.1f} to {noise.end_s:.1f} s of {whole:.1f} s"
+    note(f"{noise.run}: static from {part}, {noise.imu.samples} samples")
+    if begin_s is None and end_s is None:
+        _note_longer_rest(recording, noise.end_s, whole)
     if noise.imu.missing:
         note(f"{noise.run}: {noise.imu.missing} missing samples were interpolated")
     for text in start.sentences:
@@ -95,6 +99,18 @@ def allan(
     for label, sensor in noise.sensors.items():
         _print_sensor(label, sensor)
     _print_tracker(noise.tracker)
+
+
+def _note_longer_rest(recording: Recording, end_s: float, whole_s: float) -> None:
+    """Print that the rest at the start was taken, and whether the run has a longer one."""
+    if end_s > whole_s - 1.0:
+        return
+    begin, end = longest_rest(recording.need_imu())
+    if end - begin > end_s + 1.0:
+        choice = f"a longer one is from {begin:g} to {end:g} s (--from {begin:g} --to {end:g})"
+    else:
+        choice = "--from and --to choose another"
+    note(f"{recording.name}: this is the rest at the start; {choice}")
 
 
 def _print_sensor(label: str, sensor: SensorNoise) -> None:

@@ -18,8 +18,10 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    quiet_option,
     robust_option,
     sort_option,
+    stage,
     wrote,
 )
 from jaxekf.estimation import parameters
@@ -177,6 +179,7 @@ def warn(made: Estimate, diagnosis: Diagnosis) -> None:
     " and drift of the parameters, or that of the tracker's samples, without them.",
 )
 @overwrite_option
+@quiet_option
 @json_option
 def estimate(
     runs: tuple[Path, ...],
@@ -213,6 +216,7 @@ def estimate(
         requested = [_within_part(requested[runs.index(r.path or r.name)], r) for r in recordings]
     for recording in recordings:
         check_output(output / recording.name, "result.json", overwrite=overwrite)
+    stage(f"estimating {len(recordings)} run{'s' * (len(recordings) > 1)} by {chosen.name}")
     if online:
         pending = (
             estimate_online(recording, chosen, params, clock=clock) for recording in recordings

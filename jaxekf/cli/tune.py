@@ -19,6 +19,7 @@ from jaxekf.cli.console import (
     overwrite_option,
     print_json,
     print_table,
+    quiet_option,
     sort_option,
     tuning_progress,
     wrote,
@@ -157,6 +158,7 @@ _RENAMED = {
 @static_option
 @output_option("tuned", "Output folder.")
 @overwrite_option
+@quiet_option
 @json_option
 def tune(
     runs: tuple[Path, ...],

@@ -1,6 +1,7 @@
 """Estimates of whole recorded runs, filtered or smoothed."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support import memory
-from jaxekf._support.compilation import jit
-from jaxekf._support.errors import FilterError, PrecisionError
+from jaxekf._support.compilation import jit, require_float64
+from jaxekf._support.errors import ArgumentError, FilterError
 from jaxekf.estimation import padding, parameters, timeline
 from jaxekf.estimation._assembly import as_estimate, model_sensors
 from jaxekf.estimation.clock import ClockName, clock_of
@@ -30,15 +31,6 @@ from jaxekf.recordings.types import NANOSECONDS, Recording
 
 Run = Recording | Path | str
 _BATCH_BYTES = 1 << 30
-
-
-def require_float64() -> None:
-    """Raise `PrecisionError` if JAX is not set to float64."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise PrecisionError(
-            "got JAX in float32, expected float64; call jaxekf.set_up() before the first array, or set"
-            " JAX_ENABLE_X64=1"
-        )
 
 
 def estimate(
@@ -80,6 +72,8 @@ def estimate(
 
     Raises
     ------
+    ArgumentError
+        An argument has another type or shape than is stated.
     RecordingError
         The recording does not fit the model, or no time in `at` is within the run.
     ModelError
@@ -138,8 +132,8 @@ def estimate_many(
 
     Raises
     ------
-    ValueError
-        The number of entries in `params` or `at` is not the number of runs.
+    ArgumentError
+        The number of entries in `params` or `at` is not the number of runs, or as in `estimate`.
     RecordingError, ModelError, FilterError, ResourceError, PrecisionError
         As in `estimate`.
 
@@ -152,16 +146,17 @@ def estimate_many(
     ['free-4', 'free-5']
     """
     require_float64()
-    if isinstance(at, Every):
-        at = [at] * len(runs)
-    if at is not None and len(at) != len(runs):
-        raise ValueError(
-            f"got requested times for {len(at)} runs, expected as many as the {len(runs)} runs; pass an"
-            " entry for each, None for a run without requested times"
-        )
     recordings = read(runs)
+    if isinstance(at, Every):
+        at = [at] * len(recordings)
+    if at is not None and (not hasattr(at, "__len__") or len(at) != len(recordings)):
+        got = f"for {len(at)} runs" if hasattr(at, "__len__") else f"of type {type(at).__name__}"
+        raise ArgumentError(
+            f"got requested times {got}, expected as many as the {len(recordings)} runs; pass an entry for"
+            " each, None for a run without requested times"
+        )
     chosen = adapted(get_model(model), recordings)
-    used = _parameters_per_run(chosen.parameters if params is None else params, len(runs))
+    used = _parameters_per_run(chosen, params, len(recordings))
     clocks = [clock_of(chosen, own, clock) for own in used]
     timelines = timeline.build_many(chosen, recordings, at, clocks)
     results = filter_timelines(chosen, used, timelines, smooth=smooth)
@@ -171,23 +166,40 @@ def estimate_many(
     ]
 
 
-def _parameters_per_run(params: Parameters | Sequence[Parameters], runs: int) -> list[Parameters]:
-    """The parameters of each run, after a check of their values."""
-    if isinstance(params, Parameters):
-        shared = parameters.as_arrays(params._replace(truth=()))
+def _parameters_per_run(
+    model: Model, params: Parameters | Sequence[Parameters] | None, runs: int
+) -> list[Parameters]:
+    """The parameters of each run, after a check of types, shapes and values."""
+    params = model.parameters if params is None else params
+    if isinstance(params, Parameters) or not isinstance(params, Sequence):
+        shared = parameters.for_model(model, params)._replace(truth=())
         parameters.check(shared)
         return [shared] * runs
     if len(params) != runs:
-        raise ValueError(
-            f"got parameters for {len(params)} runs, expected as many as the {runs} runs; pass a set for"
-            " each, or one for all"
+        raise ArgumentError(
+            f"params: got {len(params)} sets of parameters, expected one for each of {runs} runs; pass a"
+            " set for each, or one for all"
         )
-    return [_parameters_per_run(own, 1)[0] for own in params]
+    return [_parameters_per_run(model, own, 1)[0] for own in params]
 
 
 def read(runs: Sequence[Run]) -> list[Recording]:
-    """The recordings of runs; paths are read from disk."""
-    return [run if isinstance(run, Recording) else run_folder.load(run) for run in runs]
+    """The recordings of runs; paths are read from disk.
+
+    Raises `ArgumentError` for one run in place of several, and for what is no run.
+    """
+    if isinstance(runs, Recording | str | os.PathLike) or not isinstance(runs, Iterable):
+        raise ArgumentError(
+            f"runs: got one {type(runs).__name__}, expected a sequence of runs; try [run]"
+        )
+    return [run if isinstance(run, Recording) else _load(run) for run in runs]
+
+
+def _load(run: Any) -> Recording:
+    if not isinstance(run, str | os.PathLike):
+        got, expected = f"a value of type {type(run).__name__}", "a jaxekf.Recording or a path"
+        raise ArgumentError(f"run: got {got}, expected {expected}; try jaxekf.load(path)")
+    return run_folder.load(Path(run))
 
 
 def filter_timelines(

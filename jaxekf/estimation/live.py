@@ -9,14 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxekf._support.compilation import jit
+from jaxekf._support import arrays
+from jaxekf._support.compilation import jit, require_float64
 from jaxekf._support.errors import FilterError, ModelError
 from jaxekf.estimation import padding
-from jaxekf.estimation.batch import evaluate_outputs, require_float64
+from jaxekf.estimation.batch import evaluate_outputs
 from jaxekf.estimation.clock import clock_of
-from jaxekf.estimation.parameters import as_arrays
+from jaxekf.estimation.parameters import for_model
 from jaxekf.estimation.timeline import knots_from
 from jaxekf.filtering import ekf
+from jaxekf.filtering.arguments import float_leaves
 from jaxekf.filtering.model import Belief, Model, Parameters, Sensor
 from jaxekf.filtering.steps import Rows, Steps
 from jaxekf.geometry import manifold
@@ -139,13 +141,13 @@ class Stream:
                 f"model '{model.name}': got no input, expected one to extrapolate by; use a model with an"
                 " input, such as tight"
             )
-        self.model, self.params = model, as_arrays(params)
+        self.model, self.params = model, for_model(model, params)
         self.dropped: dict[str, int] = {sensor.name: 0 for sensor in model.sensors}
         self._horizon_ns, self._capacity = round(horizon_s * NANOSECONDS), capacity
-        self._belief = jax.tree.map(jnp.asarray, belief)
+        self._belief = jax.tree.map(jnp.asarray, float_leaves("belief", belief))
         self._rejecting_s: Any = None
-        self._base_ns, self._base_is_open = int(start_ns), True
-        self._start_ns = int(start_ns)
+        self._start_ns = self._base_ns = arrays.whole_number(start_ns, arrays.argument("start_ns"))
+        self._base_is_open = True
         self._clock = replace(clock_of(model, self.params, "imu"), start_ns=self._start_ns)
         self._times: list[int] = []
         self._placed: list[int] = []
@@ -167,6 +169,7 @@ class Stream:
         ModelError
             The time does not increase, the gap before it is too long, or the shape differs from before.
         """
+        time_ns = arrays.whole_number(time_ns, arrays.argument("time_ns"))
         if self._times and time_ns <= self._times[-1]:
             raise ModelError(
                 f"got an input at {time_ns} ns after one at {self._times[-1]} ns, expected times that"
@@ -181,13 +184,13 @@ class Stream:
                 f" gap over {LONGEST_INPUT_GAP_S} s, because the input is not extrapolated; start a new"
                 " stream from a belief after the gap"
             )
-        sample = np.asarray(value, float)
+        sample = arrays.floats(value, arrays.argument("value"))
         if self._values and sample.shape != self._values[0].shape:
             raise ModelError(
                 f"got an input of shape {sample.shape}, expected {self._values[0].shape} as before; pass"
                 " all channels of every sample"
             )
-        self._times.append(int(time_ns))
+        self._times.append(time_ns)
         self._placed.append(placed)
         self._values.append(sample)
 
@@ -221,14 +224,16 @@ class Stream:
             The model has no such sensor, or the sample does not have the shapes of its space.
         """
         definition = self.model.sensor(sensor)
+        taken_ns = arrays.whole_number(taken_ns, arrays.argument("taken_ns"))
         late = taken_ns < self._base_ns or (taken_ns == self._base_ns and not self._base_is_open)
         if late:
             self.dropped[sensor] += 1
             return False
+        value = arrays.float_tree(value, arrays.argument("value"))
         _check_shapes(definition, value)
-        rows = np.broadcast_to(np.asarray(mask, bool), definition.rows)
+        rows = np.broadcast_to(arrays.flags(mask, arrays.argument("mask")), definition.rows)
         aux = definition.typical_aux if aux is None else aux
-        self._samples.setdefault(int(taken_ns), {})[sensor] = _Sample(value, rows, aux)
+        self._samples.setdefault(taken_ns, {})[sensor] = _Sample(value, rows, aux)
         return True
 
     def known(self) -> Known:

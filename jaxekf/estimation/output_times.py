@@ -5,12 +5,14 @@ own belief and not an interpolation.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxekf._support.errors import RecordingError
+from jaxekf._support import arrays
+from jaxekf._support.errors import ArgumentError, RecordingError
 from jaxekf.io.csv_table import need_time, read_table, read_times
 from jaxekf.recordings.types import NANOSECONDS, Times
 
@@ -23,7 +25,7 @@ class Every:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         The period is not a positive integer.
 
     Examples
@@ -42,11 +44,13 @@ class Every:
     """Period in nanoseconds, at least 1."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.period_ns, int) or self.period_ns < 1:
-            raise ValueError(
-                f"got a period of {self.period_ns!r} ns, expected a whole number of at least 1; see"
-                " jaxekf.every, which takes seconds"
+        period = arrays.whole_number(self.period_ns, arrays.argument("period_ns"))
+        if period < 1:
+            raise ArgumentError(
+                f"got a period of {period} ns, expected a whole number of at least 1; see jaxekf.every,"
+                " which takes seconds"
             )
+        object.__setattr__(self, "period_ns", period)
 
 
 OutputTimes = Times | Every
@@ -68,8 +72,8 @@ def every(seconds: float) -> Every:
 
     Raises
     ------
-    ValueError
-        The period is less than a nanosecond or not finite.
+    ArgumentError
+        The period is not a number, is less than a nanosecond, or is not finite.
 
     Examples
     --------
@@ -81,9 +85,9 @@ def every(seconds: float) -> Every:
     >>> estimate.requested.attitude.value.shape
     (1201, 4)
     """
-    period = float(seconds) * NANOSECONDS
+    period = arrays.number(seconds, arrays.argument("seconds")) * NANOSECONDS
     if not 1.0 <= period < np.inf:
-        raise ValueError(
+        raise ArgumentError(
             f"got a period of {seconds} s, expected a nanosecond or more; pass seconds, such as 0.01"
         )
     return Every(round(period))
@@ -150,15 +154,7 @@ def select_output_times(
                 "a longer period",
             )
         return start + requested.period_ns * np.arange(count, dtype=np.int64), None
-    times = np.asarray(requested)
-    if times.ndim != 1 or times.dtype.kind not in "iu" or np.ma.isMaskedArray(requested):
-        raise RecordingError(
-            place,
-            f"requested times of type {times.dtype} and shape {times.shape}, or masked",
-            "int64 nanoseconds on the estimate's clock, shape (N,), none masked",
-            "np.round(seconds * 1e9).astype(np.int64), or jaxekf.every(seconds)",
-        )
-    times = times.astype(np.int64)
+    times = arrays.times(requested, partial(RecordingError, f"{place}: requested times (at)"))
     if (np.diff(times) <= 0).any():
         raise RecordingError(
             place, "requested times that do not increase", "each once, in order", "np.unique"

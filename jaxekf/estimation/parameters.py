@@ -11,6 +11,7 @@ import numpy as np
 import tomli_w
 
 from jaxekf._support.errors import ModelError, RecordingError
+from jaxekf.filtering import arguments
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.io.atomic import write_whole
 from jaxekf.io.run_folder import SCHEMA_VERSION
@@ -22,6 +23,11 @@ _SECTIONS = ("noise", "calibration", "initial")
 def as_arrays(params: Parameters) -> Parameters:
     """The parameters with float arrays as leaves."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+
+
+def for_model(model: Model, params: Parameters) -> Parameters:
+    """The parameters with float arrays as leaves, as `arguments.parameters` checks them."""
+    return as_arrays(arguments.parameters(model, params))
 
 
 def for_runs(params: Parameters, setup: Any, runs: int) -> Parameters:
@@ -109,6 +115,7 @@ def save(path: Path | str, model: Model, params: Parameters, origin: Mapping[str
     >>> print("; ".join(lines[at : at + 4]))
     [noise.optical]; value = 0.005235987755982988; unit = "rad"; value_deg = 0.3
     """
+    params = arguments.parameters(model, params, check_shapes=False)
     save_noise(path, model, params, origin)
     if leaf_names(params.calibration):
         save_calibration(path, model, params, origin)

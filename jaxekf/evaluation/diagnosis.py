@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxekf._support import chi_square
+from jaxekf._support import arrays, chi_square
+from jaxekf._support.errors import ArgumentError
 from jaxekf.estimation.result import Estimate
 from jaxekf.evaluation._fault_signatures import (
     BIAS,
@@ -154,7 +155,7 @@ def diagnose(estimate: Estimate, recording: Recording | None = None) -> Diagnosi
 
     Raises
     ------
-    ValueError
+    ArgumentError
         As `diagnose_many`.
 
     Examples
@@ -190,7 +191,7 @@ def diagnose_many(
 
     Raises
     ------
-    ValueError
+    ArgumentError
         For no estimates, for excerpts (`Estimate.requested`), and for recordings that are not those of the
         estimates.
 
@@ -229,19 +230,23 @@ def diagnose_many(
 
 
 def _check(estimates: Sequence[Estimate], recordings: Sequence[Recording] | None) -> None:
-    if not estimates:
-        raise ValueError(
+    if not isinstance(estimates, Sequence) or not estimates:
+        raise ArgumentError(
             "got no estimates, expected at least one; pass the result of jaxekf.estimate_many"
         )
+    for estimate in estimates:
+        arrays.need(estimate, Estimate, "estimate", "the result of jaxekf.estimate")
+    for recording in recordings or ():
+        arrays.need(recording, Recording, "recording", "jaxekf.load(path)")
     if excerpts := [estimate.run for estimate in estimates if estimate.excerpt]:
-        raise ValueError(
+        raise ArgumentError(
             f"got requested times of {excerpts} only, expected whole estimates, whose states belong"
             " to the innovations; pass the estimates before the selection of times"
         )
     if recordings is not None:
         runs, given = [estimate.run for estimate in estimates], [r.name for r in recordings]
         if runs != given:
-            raise ValueError(
+            raise ArgumentError(
                 f"got recordings {given} for estimates of {runs}, expected the same runs in the same"
                 " order; pass each estimate's own recording"
             )

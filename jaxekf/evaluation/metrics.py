@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxekf._support import arrays
 from jaxekf.estimation.result import Estimated
 from jaxekf.evaluation._time_shift import attitude_shift, rate_shift
 from jaxekf.recordings.truth import encoder_at, encoder_rate_at, encoder_velocity_at
@@ -253,6 +254,11 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
+    arrays.need(recording, Recording, "recording", "jaxekf.load(path)")
+    if not hasattr(estimate, "outputs"):
+        got = f"a value of type {type(estimate).__name__}"
+        raise arrays.argument("estimate")(got, "an estimate", "the result of jaxekf.estimate")
+    burn_in_s = arrays.number(burn_in_s, arrays.argument("burn_in_s"))
     time_ns = estimate.clock.to_imu(estimate.time_ns)
     judged = encoder_at(recording.need_encoder(), time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.deprecations import renamed_arguments, warn_renamed
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering import _gating as gating
@@ -24,6 +25,7 @@ from jaxekf.filtering._iterated_update import with_iterated_update
 from jaxekf.filtering._linearisation import linearise_sensor
 from jaxekf.filtering._lowered_model import ABOUT_PATH, AT_ESTIMATE, Linearisation, LoweredModel
 from jaxekf.filtering._step import SubstepInput
+from jaxekf.filtering.arguments import float_leaves, for_filter, parameters
 from jaxekf.filtering.interpolation import InputSample, sample
 from jaxekf.filtering.lowering import batching
 from jaxekf.filtering.lowering.reverse_only import reverse_only
@@ -145,7 +147,10 @@ def initial_belief(model: Model, params: Parameters, first: Mapping[str, Any]) -
     >>> print(np.rad2deg(np.sqrt(np.diagonal(belief.cov))).round(1))  # deg and deg/s
     [10. 10. 10.  1.  1.  1.]
     """
-    return Belief(model.initial_mean(first), model.initial_covariance(params))
+    require_float64()
+    given = parameters(model, params, check_shapes=False)
+    mean = model.initial_mean(float_leaves("first", dict(first)))
+    return Belief(mean, model.initial_covariance(given))
 
 
 @renamed_arguments(refused="rejecting_s")
@@ -203,7 +208,8 @@ def run_filter(
     >>> bool(output.instants.healthy.all())
     True
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps, rejecting_s))
+    given = *for_filter(model, params, belief, steps), rejecting_s
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], given)
     options = {"keep": keep, "adjoint": adjoint, "checkpoint": checkpoint, "rejecting_s": one[3]}
     options |= {"relinearise": relinearise}
     return jax.tree.map(lambda a: a[0], run_filter_batch(model, *one[:3], **options))
@@ -269,7 +275,8 @@ def run_filter_batch(
         raise ModelError(
             f"got keep='{keep}', expected one of {sorted(_SAVE_SPECS)}; choose one of these"
         )
-    params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
+    given = for_filter(model, params, belief, steps)
+    params, belief, steps = jax.tree.map(jnp.asarray, given)
     lowered, prepared, inputs = lower_model(model, params, belief, steps, relinearise)
     u = inputs.substeps.u
     save, first = _SAVE_SPECS[keep], ScanInit(belief, rejecting_s)

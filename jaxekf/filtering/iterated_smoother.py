@@ -28,6 +28,7 @@ from jaxekf.filtering._epoch import ScanInputs
 from jaxekf.filtering._lowered_model import ABOUT_PATH, BoundModel, LoweredModel
 from jaxekf.filtering._smoother_pass import Information
 from jaxekf.filtering._step import SubstepInput
+from jaxekf.filtering.arguments import for_filter
 from jaxekf.filtering.lowering import structured_matrix
 from jaxekf.filtering.lowering.batched_products import congruence, diagonal_matrix, multiply_vector
 from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp
@@ -137,7 +138,8 @@ def run_iterated_smoother(
     >>> bool(output.moved[0] < 0.1)  # standard deviations
     True
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
+    given = for_filter(model, params, belief, steps)
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], given)
     found = run_iterated_smoother_batch(model, *one, iterations=iterations, adjoint=adjoint)
     return jax.tree.map(lambda a: a[0], found)
 
@@ -185,7 +187,8 @@ def run_iterated_smoother_batch(
             f"model '{model.name}': got a sensor with heavy tails, expected gates or none, for least"
             " squares know no tails; take run_smoother, or jaxekf.robust(model, 'gate')"
         )
-    params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
+    given = for_filter(model, params, belief, steps)
+    params, belief, steps = jax.tree.map(jnp.asarray, given)
     first = smoother.run_smoother_batch(
         model, params, belief, steps, adjoint=adjoint, devices=devices
     )

@@ -16,6 +16,7 @@ from jax import Array
 
 from jaxekf._support.deprecations import renamed_fields
 from jaxekf._support.errors import ModelError
+from jaxekf.filtering.model_origin import reduced
 from jaxekf.geometry import manifold
 from jaxekf.recordings.types import Recording, Samples
 
@@ -319,6 +320,9 @@ class Input:
 class Model:
     """A system to be estimated. Instances are compared by identity: build each once.
 
+    Copies are the same object. A model is pickled by its name, by how it was adapted, or by the module and
+    name that hold it, and is then the same object again; any other one by its functions.
+
     Examples
     --------
     The state of `loose`, and the noise parameters with their units:
@@ -379,6 +383,15 @@ class Model:
     hold_to: str | None = None
     """Name of the sensor at whose sampling instants every other stream is held (zero-order hold), as in the
     published discrete-time filter; None takes every sample at its own time."""
+
+    def __copy__(self) -> "Model":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "Model":
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return reduced(self)
 
     @property
     def error_dim(self) -> int:

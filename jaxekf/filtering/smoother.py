@@ -16,6 +16,7 @@ from jaxekf.filtering import ekf
 from jaxekf.filtering._epoch import ScanInit
 from jaxekf.filtering._lowered_model import LoweredModel
 from jaxekf.filtering._smoother_pass import FilteredBeliefs, smooth_backward
+from jaxekf.filtering.arguments import for_filter
 from jaxekf.filtering.ekf import FilterOutput
 from jaxekf.filtering.lowering.batched_vjp import batched, batched_with_vjp
 from jaxekf.filtering.lowering.reverse_only import reverse_only
@@ -85,7 +86,8 @@ def run_smoother(
     >>> bool(after.trace(axis1=-2, axis2=-1).mean() < before.trace(axis1=-2, axis2=-1).mean())
     True
     """
-    one = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, belief, steps))
+    given = for_filter(model, params, belief, steps)
+    one = jax.tree.map(lambda a: jnp.asarray(a)[None], given)
     found = run_smoother_batch(model, *one, adjoint=adjoint)
     return jax.tree.map(lambda a: a[0], found)
 
@@ -139,7 +141,8 @@ def run_smoother_batch(
     >>> cov.shape, bool(variance[0] < variance[1])
     ((2, 1501, 2, 6, 6), True)
     """
-    params, belief, steps = jax.tree.map(jnp.asarray, (params, belief, steps))
+    given = for_filter(model, params, belief, steps)
+    params, belief, steps = jax.tree.map(jnp.asarray, given)
     filtered = ekf.run_filter_batch(
         model, params, belief, steps, keep="everything", adjoint=adjoint, devices=devices
     )

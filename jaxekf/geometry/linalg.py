@@ -13,6 +13,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxekf._support.errors import ArgumentError
+
 
 def symmetrise(matrix: Array) -> Array:
     """The symmetric part, (n, n, ...).
@@ -122,7 +124,7 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         For any other shape.
 
     Examples
@@ -139,7 +141,7 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
         return jnp.diag(deviation)
     if deviation.shape == (dim, dim):
         return jnp.tril(deviation)
-    raise ValueError(
+    raise ArgumentError(
         f"got a noise parameter of shape {deviation.shape}, expected (), ({dim},) or ({dim}, {dim});"
         " give one standard deviation, one for each axis, or a lower-triangular factor"
     )

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxekf._support.errors import ArgumentError
 from jaxekf.geometry import linalg, rotation
 
 
@@ -195,7 +196,7 @@ def triad_covariance(
 
     Raises
     ------
-    ValueError
+    ArgumentError
         For a covariance of another shape.
 
     Examples
@@ -212,7 +213,7 @@ def triad_covariance(
     for cov in (first_cov, second_cov):
         # Any other shape would be broadcast, to a result that is no covariance.
         if jnp.shape(cov) != (3, 3):
-            raise ValueError(
+            raise ArgumentError(
                 f"got a covariance of shape {jnp.shape(cov)}, expected (3, 3); of a standard deviation it"
                 " is sigma**2 * jnp.eye(3), and for many attitudes use jax.vmap"
             )

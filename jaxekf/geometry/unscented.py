@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf._support.errors import ArgumentError
 from jaxekf.geometry import linalg, manifold
 
 
@@ -87,7 +88,7 @@ def transform(
 
     Raises
     ------
-    ValueError
+    ArgumentError
         If ``alpha^2 (n + kappa)`` is not positive, or if the shapes do not match.
 
     Examples
@@ -105,13 +106,13 @@ def transform(
     mean, cov = jnp.asarray(mean), jnp.asarray(cov)
     size = mean.shape[0] if mean.ndim == 1 else -1
     if cov.shape != (size, size):
-        raise ValueError(
+        raise ArgumentError(
             f"got a mean of shape {mean.shape} and a covariance of shape {cov.shape}, expected (n,)"
             " and (n, n); for many of them use jax.vmap"
         )
     squared_distance = alpha**2 * (size + kappa)
     if not squared_distance > 0.0:
-        raise ValueError(
+        raise ArgumentError(
             f"got alpha = {alpha} and kappa = {kappa} for {size} numbers, expected"
             " alpha^2 (n + kappa) > 0; try alpha = 1 and kappa = 0"
         )

@@ -8,6 +8,7 @@ use ``jax.vmap`` for many. Derivatives are finite everywhere, and zero where `At
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxekf._support.errors import ArgumentError
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.triad import Attitude, attitude_or, default_threshold, directions, float_type
 
@@ -121,7 +122,7 @@ def _pairs(body: Array, reference: Array, weights: Array | None) -> tuple[Array,
     dtype = float_type(body, reference)
     body, reference = jnp.asarray(body, dtype), jnp.asarray(reference, dtype)
     if body.ndim != 2 or body.shape[1] != 3 or body.shape != reference.shape:
-        raise ValueError(
+        raise ArgumentError(
             f"got vectors of shapes {body.shape} and {reference.shape}, expected (n, 3) for both;"
             " for many attitudes use jax.vmap"
         )

@@ -19,6 +19,7 @@ from jaxekf.checks import plausibility, pose_flips
 from jaxekf.io import _section_entries as section_entries
 from jaxekf.io import _stamp_repair as stamp_repair
 from jaxekf.io import container, description
+from jaxekf.io._unit_row import read_unit_row
 from jaxekf.io.atomic import whole_folder
 from jaxekf.io.csv_table import Table, read_table, write_sheet
 from jaxekf.io.description import SCHEMA_VERSION, Source
@@ -95,7 +96,7 @@ def _load_folder(folder: Path, sort: bool) -> Recording:
         how = section_entries.layout(label, section, place)
         file = folder / (how.file or f"{label}.csv")
         if file.exists() or label in about:
-            table = read_table(file, how)
+            table, section = read_unit_row(read_table(file, how), schema, section, place)
             tables = [table, *(_beside(folder / name, file.name) for name in schema.beside)]
             for one in tables:
                 _check_hash(one, hashes)
@@ -160,8 +161,8 @@ def load_imu(path: Path | str) -> Recording:
     (['imu'], (3001, 3))
     """
     file = Path(path)
-    table = read_table(file)
-    imu, account = SCHEMAS["imu"].read_table(table, Source({}, file, False))
+    table, section = read_unit_row(read_table(file), SCHEMAS["imu"], {}, file)
+    imu, account = SCHEMAS["imu"].read_table(table, Source(section, file, False))
     account = _completed(account, table, imu.time_ns)
     return Recording(file.stem, imu=imu, path=file, intake={"imu": account})
 

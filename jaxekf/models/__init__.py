@@ -14,6 +14,7 @@ from pkgutil import iter_modules
 
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering.model import Model
+from jaxekf.filtering.model_origin import remember
 from jaxekf.recordings.types import Recording
 
 
@@ -45,6 +46,11 @@ def get_model(model: str | Model) -> Model:
     """
     if isinstance(model, Model):
         return model
+    if not isinstance(model, str):
+        raise ModelError(
+            f"got a model of type {type(model).__name__}, expected a jaxekf.Model or a name; choose one of"
+            f" {sorted(REGISTRY)}"
+        )
     if model in REGISTRY:
         return REGISTRY[model]
     if ":" not in model:
@@ -67,6 +73,7 @@ def get_model(model: str | Model) -> Model:
             f"got '{model}' of type {type(found).__name__}, expected a jaxekf.Model;"
             " name the attribute that holds the model"
         )
+    remember(found, get_model, model)
     return found
 
 
@@ -74,6 +81,8 @@ def _all_models() -> dict[str, Model]:
     names = (module.name for module in iter_modules(__path__) if not module.name.startswith("_"))
     modules = [importlib.import_module(f"{__name__}.{name}") for name in names]
     found = [one for module in modules for one in vars(module).values() if isinstance(one, Model)]
+    for model in found:
+        remember(model, get_model, model.name, replace_known=True)
     return {model.name: model for model in sorted(found, key=lambda model: model.name)}
 
 

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.constants import GRAVITY_REF
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry import triad
@@ -129,6 +130,7 @@ def attitudes(
 
     They are valid if the sine of the angle between the two is not below `least_sine`.
     """
+    require_float64()
     return _attitudes(force, field, -about.gravity_ref, about.field_ref, least_sine)
 
 

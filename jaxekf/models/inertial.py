@@ -197,6 +197,14 @@ def _rate(x: State, measured: Array, params: Parameters) -> Array:
     return params.calibration.gyroscope_matrix @ measured[:3] - x.bias
 
 
+def _object_position(x: State, u: InputSample, params: Parameters) -> Array:
+    return x.position + rotation.rotate(x.q_ref_body, params.setup.p_body_object)
+
+
+def _object_attitude(x: State, u: InputSample, params: Parameters) -> Array:
+    return rotation.product(x.q_ref_body, params.setup.q_body_object)
+
+
 def _object_velocity(x: State, u: InputSample, params: Parameters) -> Array:
     lever_velocity = rotation.cross(_rate(x, u.value, params), params.setup.p_body_object)
     return x.velocity + rotation.rotate(x.q_ref_body, lever_velocity)
@@ -227,18 +235,18 @@ OUTPUTS = (
     _outputs.POSITION,
     _outputs.ATTITUDE,
     _outputs.VELOCITY,
-    _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
+    _outputs.rate_of_reading(_rate, rate_noise),
     Output(
         "object_position",
         _outputs.METRES,
         "reference",
-        lambda x, u, params: x.position + rotation.rotate(x.q_ref_body, params.setup.p_body_object),
+        _object_position,
     ),
     Output(
         "object_attitude",
         SO3(),
         "object",
-        lambda x, u, params: rotation.product(x.q_ref_body, params.setup.q_body_object),
+        _object_attitude,
     ),
     Output(
         "object_velocity",

@@ -182,12 +182,12 @@ MODEL = Model(
     input=Input(
         "gyroscope",
         sources.gyroscope,
-        lambda params: params.calibration.clock_offset,
-        lambda params: params.calibration.clock_drift,
+        sources.clock_offset,
+        sources.clock_drift,
     ),
     outputs=(
         _outputs.ATTITUDE,
-        _outputs.rate(lambda x, u, params: _rate(x, u.value, params), rate_noise),
+        _outputs.rate_of_reading(_rate, rate_noise),
     ),
 )
 

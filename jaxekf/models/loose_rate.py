@@ -131,7 +131,7 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=inertial.initial_covariance,
     start_with=("optical",),
-    outputs=(_outputs.ATTITUDE, _outputs.rate(lambda x, u, params: x.rate)),
+    outputs=(_outputs.ATTITUDE, _outputs.rate(_outputs.rate_state)),
 )
 
 

@@ -299,9 +299,9 @@ MODEL = Model(
     initial_covariance=inertial.initial_covariance,
     find_start=find_start,
     setup=earth.setup,
-    input=Input("imu", sources.imu, lambda params: params.calibration.clock_offset),
+    input=Input("imu", sources.imu, sources.clock_offset),
     outputs=(
         _outputs.ATTITUDE,
-        _outputs.rate(lambda x, u, params: body_rate(x, u.value, params), rate_noise),
+        _outputs.rate_of_reading(body_rate, rate_noise),
     ),
 )

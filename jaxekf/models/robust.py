@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, Literal, get_args
 
 from jaxekf._support.deprecations import renamed_arguments
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering.model import Model, Sensor
+from jaxekf.filtering.model_origin import remembered
 from jaxekf.models import get_model
 from jaxekf.recordings.types import Recording
 
@@ -56,7 +57,7 @@ def robust(model: str | Model, outlier_method: OutlierMethod, probability: float
     return _robust(get_model(model), outlier_method, probability)
 
 
-@lru_cache(maxsize=64)
+@remembered
 def _robust(model: Model, outlier_method: OutlierMethod, probability: float) -> Model:
     is_weight = outlier_method in ("huber", "student")
     changes: dict[str, Any] = {

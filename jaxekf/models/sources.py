@@ -1,9 +1,11 @@
 """Samples that the sensors and inputs of the models read from a recording."""
 
 import numpy as np
+from jax import Array
 
 from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
+from jaxekf.filtering.model import Parameters
 from jaxekf.recordings.clipping import clipped
 from jaxekf.recordings.types import Floats, Markers, Optical, Recording, Samples, to_scipy
 
@@ -57,6 +59,16 @@ def imu(recording: Recording) -> Samples:
     finite = np.asarray(np.isfinite(both).all(axis=1))
     beyond = clipped(stream.gyroscope)
     return Samples(stream.time_ns, both, finite, origin=("imu",), at_limit=beyond)
+
+
+def clock_offset(params: Parameters) -> Array:
+    """Offset of the IMU's clock, s, of a model that has it among its parameters."""
+    return params.calibration.clock_offset
+
+
+def clock_drift(params: Parameters) -> Array:
+    """Its growth, s/s."""
+    return params.calibration.clock_drift
 
 
 def tracked_position(optical: Optical, recording: Recording) -> Floats:

@@ -11,7 +11,7 @@ marker is a sensor of its own, used at the time of its measurement.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jax import Array
 
 from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.filtering.model import Input, Model, Parameters, Sensor, Start
+from jaxekf.filtering.model_origin import remembered
 from jaxekf.geometry import linalg, rotation
 from jaxekf.geometry.manifold import Euclidean
 from jaxekf.models import inertial, sources
@@ -133,7 +134,7 @@ def adapt(recordings: Sequence[Recording]) -> Model:
     return for_markers(tuple(names)) if names else MODEL
 
 
-@lru_cache(maxsize=32)
+@remembered
 def for_markers(names: tuple[str, ...]) -> Model:
     """The model for markers of these names; the same object for the same names."""
     params = DEFAULTS

@@ -82,6 +82,14 @@ class Readings(NamedTuple):
 SPACE: Any = State(SO3(), Euclidean(3, "rad/s"))
 
 
+def _rate(x: State, measured: Array, params: Parameters) -> Array:
+    return measured - x.bias
+
+
+def _rate_noise(u: InputSample, params: Parameters) -> Array:
+    return linalg.covariance(params.noise.rate, 3) * u.bandwidth
+
+
 def transition(x: State, u: InputSample, dt: Array, w: Array, params: Parameters) -> State:
     """``q exp((mean rate - bias) dt + w_angle)`` and ``bias + w_bias``."""
     turn = (u.mean - x.bias) * dt + w[:3]
@@ -165,12 +173,9 @@ MODEL = Model(
     initial_mean=initial_mean,
     initial_covariance=inertial.initial_covariance,
     start_with=("attitude",),
-    input=Input("gyroscope", sources.gyroscope, lambda params: params.calibration.clock_offset),
+    input=Input("gyroscope", sources.gyroscope, sources.clock_offset),
     outputs=(
         _outputs.ATTITUDE,
-        _outputs.rate(
-            lambda x, u, params: u.value - x.bias,
-            lambda u, params: linalg.covariance(params.noise.rate, 3) * u.bandwidth,
-        ),
+        _outputs.rate_of_reading(_rate, _rate_noise),
     ),
 )

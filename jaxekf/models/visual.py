@@ -22,7 +22,7 @@ the point enters the slope there, and its depth the noise.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +33,7 @@ from jax import Array
 from jaxekf._support.constants import GRAVITY_REF
 from jaxekf._support.deprecations import renamed
 from jaxekf.filtering.model import Model, Parameters, Sensor, repeated
+from jaxekf.filtering.model_origin import remembered
 from jaxekf.geometry import linalg, pinhole, rotation
 from jaxekf.geometry.manifold import SO3, Euclidean
 from jaxekf.geometry.pinhole import Lens
@@ -244,7 +245,7 @@ def adapt(bilinear: bool, recordings: Sequence[Recording]) -> Model:
     return for_points(-(-max(most, 1) // _FEWEST) * _FEWEST, bilinear)
 
 
-@lru_cache(maxsize=32)
+@remembered
 def for_points(count: int, bilinear: bool = False) -> Model:
     """The model for images of up to `count` landmarks; the same object for the same numbers."""
     return _build(count, bilinear)
@@ -305,7 +306,7 @@ OUTPUTS = (
     _outputs.POSITION,
     _outputs.ATTITUDE,
     _outputs.VELOCITY,
-    _outputs.rate(lambda x, u, params: x.rate),
+    _outputs.rate(_outputs.rate_state),
 )
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxekf._support.errors import ArgumentError
 from jaxekf.geometry.linalg import standard_deviation_factor
 
 # Singular values below this part of the largest count as zero.
@@ -136,7 +137,7 @@ def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         If the shapes do not match.
 
     Examples
@@ -152,7 +153,7 @@ def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
     """
     positions, axes = jnp.asarray(array.positions), jnp.asarray(array.axes)
     if positions.ndim != 2 or positions.shape[1] != 3 or axes.shape != positions.shape:
-        raise ValueError(
+        raise ArgumentError(
             f"got positions of shape {positions.shape} and axes of shape {axes.shape},"
             " expected (n, 3) for both; give a place and a direction for every axis"
         )

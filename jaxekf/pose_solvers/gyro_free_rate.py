@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxekf._support.errors import ArgumentError
 from jaxekf.geometry.linalg import multiply, multiply_transposed, symmetrise
 from jaxekf.geometry.quadratic_least_squares import (
     Factors,
@@ -200,13 +201,13 @@ def track(
 
     Raises
     ------
-    ValueError
+    ArgumentError
         If the number of columns is not that of the axes.
     """
     readings, start_rate = jnp.asarray(readings), jnp.asarray(start_rate)
     n = jnp.shape(array.axes)[0]
     if readings.ndim != 2 or readings.shape[1] != n:
-        raise ValueError(
+        raise ArgumentError(
             f"got readings of shape {readings.shape}, expected (N, {n}); give one column for each axis"
         )
     prepared = differences(array, noise)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support import arrays
 from jaxekf._support.deprecations import renamed
 from jaxekf._support.errors import RecordingError
 from jaxekf.geometry.host_rotation import nearest_rotation
@@ -78,6 +79,9 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
     >>> np.allclose(pose.q_ref_body, np.sqrt([0.5, 0.0, 0.0, 0.5])), bool(pose.valid[0])
     (True, True)
     """
+    p_body_marker = arrays.floats(p_body_marker, arrays.argument("p_body_marker"), (None, 3))
+    position = arrays.floats(position, arrays.argument("position"), (None, len(p_body_marker), 3))
+    usable = arrays.flags(usable, arrays.argument("usable"), position.shape[:2])
     usable = usable & np.isfinite(position).all(axis=2)
     count = usable.sum(axis=1)
     weight = usable / np.maximum(count, 1)[:, None]

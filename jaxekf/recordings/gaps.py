@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxekf._support import arrays
 from jaxekf._support.errors import RecordingError
 from jaxekf.recordings.accounts import Intake, Part, Reason
 from jaxekf.recordings.types import NANOSECONDS, Flags, Recording, Times, period_ns
@@ -54,6 +55,8 @@ def crop(recording: Recording, start_s: float = 0.0, end_s: float = np.inf) -> R
     time = recording.need_imu().time_ns
     length_s = float(time[-1] - time[0]) / NANOSECONDS
     last = np.iinfo(np.int64).max
+    start_s = arrays.number(start_s, arrays.argument("start_s"))
+    end_s = arrays.number(end_s, arrays.argument("end_s"))
     begin = int(time[0]) + round(max(start_s, 0.0) * NANOSECONDS) if start_s <= length_s else last
     end = int(time[0]) + round(end_s * NANOSECONDS) if end_s <= length_s else last
     if not ((time >= begin) & (time < end)).any():

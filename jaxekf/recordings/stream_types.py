@@ -1,22 +1,21 @@
 """The streams of a recorded run: one class for each kind of sensor, samples in order of time.
 
 A stream is a frozen dataclass of NumPy arrays, one entry for each sample. Units are SI. A sample that must
-not be used is invalid, not removed.
+not be used is invalid, not removed. Lists, other number types and columns of pandas are converted; times
+must be whole nanoseconds.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxekf._support import arrays
+from jaxekf._support.arrays import Shape
 from jaxekf._support.errors import RecordingError
-
-Times = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from jaxekf.recordings._stream_arrays import Flags, Floats, Times, convert
 
 
 class _Stream:
@@ -24,8 +23,13 @@ class _Stream:
 
     per_sample: ClassVar[tuple[str, ...]] = ()
     """Names of the fields that have one entry for each sample, without the times."""
+    shapes: ClassVar[Mapping[str, Shape]] = {}
+    """Shape of fields that is known without the other fields, None for the number of samples."""
     time_ns: Times
     latency_ns: int = 0
+
+    def __post_init__(self) -> None:
+        convert(self, type(self).__name__.lower(), {"time_ns": (None,), **self.shapes})
 
     @property
     def arrays(self) -> dict[str, Any]:
@@ -52,6 +56,17 @@ class PlainStream(_Stream):
     values: Mapping[str, Floats]
     """Arrays (N, c) by field, SI units; NaN where a cell is blank."""
     latency_ns: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        values = {}
+        for name, value in self.values.items():
+            refuse = partial(RecordingError, "stream", column=name)
+            values[name] = arrays.floats(value, refuse)
+            if values[name].ndim != 2:
+                got, expected = f"an array of shape {values[name].shape}", "one of shape (N, c)"
+                raise refuse(got, expected, "values[:, None] for one column")
+        object.__setattr__(self, "values", values)
 
     @property
     def arrays(self) -> dict[str, Any]:
@@ -105,6 +120,13 @@ class Optical(_Stream):
     """Time from a sample to its stamp."""
 
     per_sample: ClassVar = ("q_ref_body", "valid", "position", "error")
+    shapes: ClassVar = {
+        "q_ref_body": (None, 4),
+        "valid": (None,),
+        "position": (None, 3),
+        "error": (None,),
+        "p_body_tool": (3,),
+    }
 
     @property
     def seen(self) -> Flags:
@@ -175,6 +197,7 @@ class Markers(_Stream):
         return np.asarray(self.usable.any(axis=1))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         count = len(self.names)
         shapes = {
             "position": (len(self.time_ns), count, 3),
@@ -254,6 +277,7 @@ class Camera(_Stream):
         return np.asarray(self.usable.any(axis=1))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         count, images = len(self.names), len(self.time_ns)
         if count == 0:
             raise RecordingError(
@@ -300,6 +324,7 @@ class Imu(_Stream):
     """Magnetic field (N, 3) in the sensor's unit."""
 
     per_sample: ClassVar = ("gyroscope", "accelerometer", "magnetometer")
+    shapes: ClassVar = dict.fromkeys(per_sample, (None, 3))
 
 
 @dataclass(frozen=True)
@@ -335,6 +360,12 @@ class Encoder(_Stream):
     """Time from a sample, on the IMU's clock, to its stamp."""
 
     per_sample: ClassVar = ("q_ref_body", "valid", "scored", "position")
+    shapes: ClassVar = {
+        "q_ref_body": (None, 4),
+        "valid": (None,),
+        "scored": (None,),
+        "position": (None, 3),
+    }
 
     @property
     def seen(self) -> Flags:

@@ -6,13 +6,16 @@ Times are int64 nanoseconds and never pass through a float. Values are SI. A sam
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support import arrays
 from jaxekf._support.errors import RecordingError
+from jaxekf.recordings._stream_arrays import convert
 from jaxekf.recordings.accounts import Intake
 from jaxekf.recordings.stream_types import (
     Camera,
@@ -92,6 +95,14 @@ class Samples:
     copies: int = 1
     """Groups in a sample, those included that only fill it up."""
 
+    def __post_init__(self) -> None:
+        label = ":".join(self.origin) or "samples"
+        convert(self, label, {})
+        for name in ("value", "aux"):
+            refuse = partial(RecordingError, label, column=name)
+            found = arrays.float_tree(getattr(self, name), refuse, keep_whole=name == "aux")
+            object.__setattr__(self, name, found)
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -103,8 +114,8 @@ class Recording:
     Raises
     ------
     RecordingError
-        A stream has no sample, arrays of different lengths, or times that are not int64 or do not increase;
-        or the name cannot be that of a folder.
+        A stream has no sample, arrays of different lengths, or times that do not increase; or the name
+        cannot be that of a folder.
 
     Examples
     --------
@@ -231,9 +242,6 @@ class Recording:
 def _check_stream(place: Path | str, label: str, stream: Any) -> None:
     """Lengths agree, there is at least one sample, time increases."""
     times = stream.time_ns
-    if times.dtype != np.int64:
-        got = f"{label} times of type {times.dtype}"
-        raise RecordingError(place, got, "int64 nanoseconds", "casting them exactly")
     for key, value in stream.arrays.items():
         if len(value) != len(times):
             got = f"{len(value)} values of {label}.{key} for {len(times)} times"

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 from scipy.spatial.transform import Rotation
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.constants import GRAVITY_REF
 from jaxekf.filtering.ekf import inputs_of
 from jaxekf.filtering.model import Model, Parameters
@@ -341,6 +342,7 @@ def draw(
     -------
     The states at the end of each substep, leading axes (K, S), and `steps` with simulated values.
     """
+    require_float64()
     steps = jax.tree.map(jnp.asarray, steps)
     inputs = inputs_of(model, params, steps)
 

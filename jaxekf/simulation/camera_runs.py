@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jaxekf._support import arrays
 from jaxekf.geometry import pinhole
 from jaxekf.recordings.types import Camera, Flags, Floats, Recording, Times, from_scipy, to_scipy
 from jaxekf.simulation.attitude_runs import Motion, sample_times, seconds
@@ -256,6 +257,7 @@ def camera_run(
     grade, mount = grade or CameraGrade(), mount or Mount()
     motion = eight(seed) if motion is None else motion
     landmarks = scene() if landmarks is None else landmarks
+    landmarks = arrays.floats(landmarks, arrays.argument("landmarks"), (None, 3))
     rng = np.random.default_rng([seed, 33])
     imu_ns = sample_times(1.0 / grade.imu.imu_s, duration_s, start_ns)
     images = sample_times(grade.camera_hz, duration_s, start_ns)

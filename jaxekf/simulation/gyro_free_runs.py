@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support import compilation
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.constants import STANDARD_GRAVITY
 from jaxekf.pose_solvers import accelerometer_array
 from jaxekf.pose_solvers.accelerometer_array import AccelerometerArray
@@ -333,6 +334,7 @@ def array_rate(
     >>> rate.shape == run.rate.shape, bool(np.isfinite(rate).all())
     (True, True)
     """
+    require_float64()
     sigma, interval = grade.acceleration_sigma, 1.0 / grade.hertz
     return np.asarray(_rates(array, sigma, readings, interval, forget_s))
 

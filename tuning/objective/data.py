@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.errors import TuningError
 from jaxekf.estimation import padding, timeline
 from jaxekf.estimation.batch import Run, read
@@ -111,6 +112,7 @@ def prepare_groups(
 
 
 def _read(model: Model, runs: Sequence[Run]) -> tuple[list[Recording], list[Timeline]]:
+    require_float64()
     if not runs:
         raise TuningError("got no run to tune on, expected at least one; name some recordings")
     recordings = read(runs)

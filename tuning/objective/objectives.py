@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxekf._support.compilation import require_float64
 from jaxekf._support.errors import TuningError
 from jaxekf.estimation import parameters
 from jaxekf.estimation.batch import evaluate_outputs, sharing_devices
-from jaxekf.filtering import ekf
+from jaxekf.filtering import arguments, ekf
 from jaxekf.filtering.model import Belief, Model, Parameters
 from jaxekf.filtering.smoother import run_smoother_batch
 from jaxekf.geometry import manifold
@@ -227,6 +228,8 @@ def evaluate(
     >>> bool(value(model.parameters) < min(value(small), value(large)))
     True
     """
+    require_float64()
+    params = arguments.parameters(model, params, check_shapes=False)
     return evaluate_each(model, objective, shared(params, data), data, counts)
 
 

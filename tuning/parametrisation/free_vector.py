@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 
 from jaxekf._support.errors import TuningError
-from jaxekf.estimation.parameters import as_arrays, leaf_names, leaves_by_name
+from jaxekf.estimation.parameters import as_arrays, for_model, leaf_names, leaves_by_name
+from jaxekf.filtering import arguments
 from jaxekf.filtering.model import Model, Parameters
 from tuning.parametrisation.leaf import WEAK_LOG, Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
@@ -207,6 +208,7 @@ def layout(
     >>> tuning.layout(model, model.parameters, [offset], runs=2).labels()
     ['calibration.clock_offset of run 0', 'calibration.clock_offset of run 1']
     """
+    params = arguments.parameters(model, params, check_shapes=False)
     values = leaves_by_name(params)
     units = leaves_by_name(model.units._replace(truth=TRUTH_UNITS if params.truth else ()))
     wanted = ["noise"] if free is None else list(free)
@@ -301,6 +303,7 @@ def with_axes(
     """
     if axes not in AXES:
         raise TuningError(f"got axes '{axes}', expected one of {AXES}; choose one")
+    params = arguments.parameters(model, params, check_shapes=False)
 
     def reshape(value: Any, dim: int) -> Any:
         value = np.asarray(value, float)
@@ -329,7 +332,7 @@ def initial_parameters(
     axes: str | None,
 ) -> Parameters:
     """Parameters to start a search from, in the shapes that it keeps."""
-    base = as_arrays(model.parameters if start is None else start)
+    base = for_model(model, model.parameters if start is None else start)
     if any((f.name if isinstance(f, Free) else f).startswith("truth") for f in free or ()):
         base = base._replace(truth=no_correction())
     return base if axes is None else with_axes(model, base, axes, free)
@@ -351,6 +354,6 @@ def scaled(params: Parameters, factor: float) -> Parameters:
     """
     root = np.sqrt(factor)
     return params._replace(
-        noise=jax.tree.map(lambda a: a * root, params.noise),
-        initial=jax.tree.map(lambda a: a * root, params.initial),
+        noise=jax.tree.map(lambda a: a * root, arguments.float_leaves("noise", params.noise)),
+        initial=jax.tree.map(lambda a: a * root, arguments.float_leaves("initial", params.initial)),
     )

@@ -3,7 +3,7 @@
 
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxekf._support.errors import RecordingError
 from jaxekf.io.importers._bags import Bag, Topic
 from jaxekf.io.streams import encoder as encoder_storage
 from jaxekf.recordings import screening
-from jaxekf.recordings.accounts import Intake, Place
+from jaxekf.recordings.accounts import Intake, Place, Reason
 from jaxekf.recordings.types import NANOSECONDS, Encoder, Flags, Floats, Imu, Optical, Times
 
 IMU = "sensor_msgs/msg/Imu"
@@ -23,8 +23,15 @@ POSE, POSE_COVARIANCE, TRANSFORM = (
 )
 TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 POSES = (POSE, POSE_COVARIANCE, TRANSFORM)
+UNREAD = {
+    "nav_msgs/msg/Odometry": "a pose to read is needed as PoseStamped or PoseWithCovarianceStamped",
+    "sensor_msgs/msg/MagneticField": "the magnetometer can be added to imu.csv as mx,my,mz",
+}
+"""Types with data that models could use, but that are not read, and a remedy."""
 SET_CLOCK_NS = 10**18
 """Later times (September 2001) are those of a clock that was set; a stamp of 0 among them is missing."""
+_FEW_UNSET = 0.01
+"""Share of messages without a stamp that are dropped; more of them are a fault of the driver."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,7 @@ class TopicSamples:
         self.frame = ""
         self._times, self._values = array("q"), array("d")
         self._receive = source.stamps == "receive"
+        self._unset: Reason | None = None
 
     def __len__(self) -> int:
         return len(self._times)
@@ -67,20 +75,37 @@ class TopicSamples:
         self._values.extend(values)
 
     def arrays(self, width: int) -> tuple[Times, Floats]:
-        """Times (N,) and numbers (N, width); raises without samples, or if stamps were not set."""
+        """Times (N,) and numbers (N, width) of the messages with a stamp; raises without samples, or if
+        more than a few stamps were not set."""
         if not self._times:
             raise self.place.error(None, None, "0 messages", "at least one", "recording again")
         time_ns = np.array(self._times, np.int64)
+        values = np.array(self._values, float).reshape(len(time_ns), width)
         unset = time_ns == 0
-        if not self._receive and (unset.all() or (unset.any() and time_ns.max() > SET_CLOCK_NS)):
+        if self._receive or not unset.any() or (not unset.all() and time_ns.max() <= SET_CLOCK_NS):
+            return time_ns, values
+        count, every = int(unset.sum()), bool(unset.all())
+        if count > _FEW_UNSET * len(time_ns):
             raise self.place.error(
-                None if unset.all() else int(np.argmax(unset)),
+                None if every else int(np.argmax(unset)),
                 "header.stamp",
-                "stamps of 0 in every header" if unset.all() else "a stamp of 0",
+                "stamps of 0 in every header" if every else f"a stamp of 0, one of {count}",
                 "stamps that are set",
                 "stamps='receive' (--stamps receive) for the times of receipt by the recorder",
             )
-        return time_ns, np.array(self._values, float).reshape(len(time_ns), width)
+        good = np.flatnonzero(~unset)
+        # In an account a message has the time of the one after it.
+        after = good[np.minimum(np.searchsorted(good, np.flatnonzero(unset)), len(good) - 1)]
+        self._unset = screening.reasoned(self.place, np.flatnonzero(unset), time_ns[after])
+        self.place = self.place.take(good)
+        return time_ns[~unset], values[~unset]
+
+    def closed(self, account: Intake) -> Intake:
+        """The account of the stream with the messages that were dropped for their stamp."""
+        if self._unset is None:
+            return account
+        dropped = {**account.dropped, "stamp of 0": self._unset}
+        return replace(account, rows=account.rows + self._unset.count, dropped=dropped)
 
 
 def imu(source: Source, topic: Topic) -> tuple[Imu, Intake]:
@@ -113,7 +138,8 @@ def imu(source: Source, topic: Topic) -> tuple[Imu, Intake]:
         f"{name}angular_velocity is rad/s and linear_acceleration m/s^2, gravity included, in"
         f" '{rows.frame}'; orientation and covariances are not read"
     )
-    return screening.imu(rows.place, time_ns, rate, force, sort=source.sort)
+    stream, account = screening.imu(rows.place, time_ns, rate, force, sort=source.sort)
+    return stream, rows.closed(account)
 
 
 def _assume_absent(source: Source, topic: Topic, absent: Flags) -> None:
@@ -165,7 +191,9 @@ def optical(source: Source, topic: Topic, child: str | None) -> tuple[Optical, I
         f"{f' {tracked!r}' if tracked else ''} to '{rows.frame}', the reference; x, y, z, w in the"
         " messages; covariances are not read"
     )
-    return screening.optical(rows.place, time_ns, values[:, :4], values[:, 4:], sort=source.sort)
+    pose = values[:, :4], values[:, 4:]
+    stream, account = screening.optical(rows.place, time_ns, *pose, sort=source.sort)
+    return stream, rows.closed(account)
 
 
 def encoder(
@@ -207,4 +235,5 @@ def encoder(
     angle = np.where(known, values[:, 0], 0.0)
     q = encoder_storage.joint_attitude(angle, {"axis": axis.tolist()}, bag.path)
     q[~known] = np.nan
-    return screening.encoder(rows.place, time_ns, q, sort=source.sort)
+    stream, account = screening.encoder(rows.place, time_ns, q, sort=source.sort)
+    return stream, rows.closed(account)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxekf._support.errors import RecordingError
 from jaxekf.io.importers import _ros_messages as ros_messages
 from jaxekf.io.importers._bags import Bag, Topic, opened
-from jaxekf.io.importers._ros_messages import IMU, JOINT, POSES, TRANSFORM, TREES, Source
+from jaxekf.io.importers._ros_messages import IMU, JOINT, POSES, TRANSFORM, TREES, UNREAD, Source
 from jaxekf.recordings.accounts import Intake
 from jaxekf.recordings.types import Floats, Recording
 
@@ -147,6 +147,10 @@ def _choose(
         source.assumptions.append(
             f"joint angles ({', '.join(left)}) are not read: the joint's axis was not given (axis)"
         )
+    for topic in bag.topics:
+        if topic.type in UNREAD and topic.stated:
+            described = f"{topic.name} ({topic.type}, {topic.stated} messages)"
+            source.assumptions.append(f"{described} is not read: {UNREAD[topic.type]}")
     return chosen
 
 

@@ -48,16 +48,17 @@ def _draw(axes: Any, sensor: SensorNoise, turn: float) -> None:
         label = "fit" if colour == _COLOURS[0] else None
         axes.plot(tau, turn * noise.deviation(tau), color=colour, lw=1, label=label)
     axes.set_xscale("log")
-    axes.set_yscale("log")
     # The bands, not the slopes, determine the limits; at least a decade, so that the scale has labels.
     low, high = turn * float(np.min(curve.low)), turn * float(np.max(curve.high))
     if high > 0.0:
+        # A sensor that never changes has nothing for a logarithmic axis.
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         low = max(low, 1e-6 * high)
         middle, reach = np.sqrt(low * high), max(1.3 * np.sqrt(high / low), np.sqrt(10.0))
         axes.set_ylim(middle / reach, middle * reach)
     axes.set_xlim(curve.tau[0] / 1.2, max(curve.tau[-1] * 1.2, 10.0 * curve.tau[0]))
     _slopes(axes, sensor, turn)
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter("{x:.2g}")
     axes.yaxis.set_minor_formatter("")
     axes.xaxis.set_major_formatter("{x:g}")

@@ -25,6 +25,8 @@ _NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
 # Standard deviations of weak priors: of a logarithm (a factor of ten), and by unit.
 _WEAK_LOG = 2.3
 _WEAK = {"s": 0.05, "1": 0.05, "rad": 0.1, "m": 0.05, "s/s": 2e-4}
+# A given prior has the same share for its step, but at most this one.
+_LONGEST_SHARE = 0.5
 AXES = ("tied", "each", "full")
 # Nearer to a bound, as a share of the half width, a number does not come.
 _INSIDE = 1.0 - 1e-9
@@ -329,18 +331,19 @@ def layout(
 
 def _leaf(name: str, value: Any, unit: str, entry: Free, runs: int) -> Leaf:
     linear = name.startswith(("calibration.", "truth."))
-    step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
     if not linear:
         _check_positive(name, value)
     kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
-    prior = entry.prior
-    if prior is None:
-        prior = _WEAK.get(unit, step) if linear else _WEAK_LOG
+    weak = _WEAK.get(unit, 1.0) if linear else _WEAK_LOG
+    prior = weak if entry.prior is None else entry.prior
     if not 0.0 < prior < np.inf:
         raise TuningError(
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
             " for a weak one"
         )
+    step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
+    if linear and entry.prior is not None:
+        step = prior * min(step / weak, _LONGEST_SHARE)
     leaf = Leaf(name, value.shape, kind, step, runs if entry.each_run else 0, prior / step)
     bounds = _bounds(name, value, kind, step, entry.bounds)
     if bounds is None:
@@ -426,10 +429,19 @@ SCALED = ("noise.", "initial.")
 """The sections that `scaled` scales."""
 
 
-def scaled(params: Parameters, factor: float) -> Parameters:
-    """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales."""
+def scaled(params: Parameters, factor: float, start: Parameters | None = None) -> Parameters:
+    """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales.
+
+    With `start` no initial deviation falls below the one there. The scale comes from errors long after the
+    beginning of a run; a bias that the next run begins with may be as large as before.
+    """
     root = np.sqrt(factor)
-    return params._replace(
-        noise=jax.tree.map(lambda a: a * root, params.noise),
-        initial=jax.tree.map(lambda a: a * root, params.initial),
-    )
+    initial = jax.tree.map(lambda a: a * root, params.initial)
+    if start is not None:
+        initial = jax.tree.map(
+            lambda new, a, first: jnp.maximum(new, jnp.minimum(a, first)),
+            initial,
+            params.initial,
+            start.initial,
+        )
+    return params._replace(noise=jax.tree.map(lambda a: a * root, params.noise), initial=initial)

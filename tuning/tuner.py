@@ -206,8 +206,7 @@ def _tuned(
         origin["gates_off"] = True
     if where.own:
         origin["own_of_each_run"] = sorted(where.own)
-    if search.fixed.any():
-        left = [i for i in np.flatnonzero(search.fixed) if i not in limits]
+    if left := [i for i in np.flatnonzero(search.fixed) if i not in limits]:
         origin["left_open"] = [where.labels()[i] for i in left]
     if validation:
         origin["validation_value"] = best.validation

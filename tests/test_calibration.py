@@ -30,6 +30,7 @@ from tuning.objective import covariance_scale, objectives
 from tuning.objective.data import prepare_groups
 from tuning.parametrisation import free_vector
 from tuning.parametrisation.truth_frame import no_correction
+from tuning.persistence.tuning_document import record
 from tuning.search.descent import Descent
 
 MODEL = jaxekf.get_model("loose")
@@ -74,7 +75,7 @@ def tuned(runs):
 
 def test_each_run_has_its_own(runs, tuned):
     """Would catch runs that are given each other's parameters, and intervals that do not hold the truth."""
-    assert len(tuned.intervals) == 9  # the bias walk is left open
+    assert len(tuned.intervals) == 10
     labels = {
         f"calibration.alignment[{i}] of run {k}": MOUNTED[k][i] for k in (0, 1) for i in range(3)
     }
@@ -93,14 +94,18 @@ def test_each_run_has_its_own(runs, tuned):
     np.testing.assert_allclose(tuned.params.calibration.alignment, mean, atol=3e-3)
 
 
-def test_what_is_left_open_stays_at_its_start(tuned):
-    """Would catch a bias walk that ten seconds do not tell and that is tuned to nothing (row 8)."""
-    assert list(tuned.open) == ["noise.bias_walk"]
-    assert "minutes" in tuned.open["noise.bias_walk"]
+def test_what_has_no_lower_limit_stays_at_its_start(tuned):
+    """Would catch a bias walk that ten seconds limit to one side only and that is tuned to nothing, and one
+    that passes for open though a large one is excluded (row 8)."""
+    assert not tuned.open
+    value, low, high = tuned.intervals["noise.bias_walk"]
+    assert low == 0.0 < value < high < 20.0 * value
     assert float(tuned.params.noise.bias_walk) == pytest.approx(
         float(tuned.start.noise.bias_walk), rel=1e-12
     )
-    assert tuned.origin["left_open"] == ["noise.bias_walk"]
+    assert "left_open" not in tuned.origin
+    sentences = [s for s in record(tuned)["warnings"] if "no lower limit" in s]
+    assert len(sentences) == 1 and "noise.bias_walk: 0 to" in sentences[0]
 
 
 def test_held_out_runs_are_fitted_without_their_truth(runs, tuned, tmp_path):
@@ -498,8 +503,8 @@ def test_command_line(runs, tuned, tmp_path):
     told = json.loads(result.stdout)
     for label, ends in tuned.intervals.items():
         np.testing.assert_allclose(told["intervals"][label], ends, rtol=1e-3, atol=1e-5)
-    assert list(told["left_open"]) == ["noise.bias_walk"]
-    assert "noise.bias_walk is unobservable" in result.stderr
+    assert not told["left_open"] and told["intervals"]["noise.bias_walk"][1] == 0.0
+    assert "no lower limit to noise.bias_walk: 0 to" in result.stderr
     own = told["own"]["run-1"]["calibration"]["alignment"]["value"]
     np.testing.assert_allclose(own, MOUNTED[1], atol=3e-3)
     assert (out / "runs" / "run-1" / "calibration.toml").is_file()

@@ -18,11 +18,10 @@ from jaxekf.cli.console import TuningBar
 from jaxekf.estimation.parameters import as_arrays
 from jaxekf.recordings.types import from_scipy, to_scipy
 from jaxekf.simulation import attitude_runs
-from tuning import tuner
 from tuning.comparison import compare, cost, cross_validation
 from tuning.comparison.allan_only import allan_only
 from tuning.objective import objectives
-from tuning.search import derivative_free, evaluation
+from tuning.search import derivative_free, evaluation, settling
 
 OPTIONS = {
     "objective": "attitude+0.01*likelihood",
@@ -362,7 +361,7 @@ def test_the_tuner_counts_what_it_filters_without_a_gradient(runs, start, found,
         calls["value"] += 1
         return 0.0
 
-    monkeypatch.setattr(tuner, "information", information)
+    monkeypatch.setattr(settling, "information", information)
     monkeypatch.setattr(evaluation, "_value", value)
     monkeypatch.setattr(evaluation, "own_step", lambda model, where, free, *given: free)
     tuned = tuning.tune(

@@ -121,11 +121,11 @@ def number(name, **changes):
         "unit": "rad",
         "logarithm": True,
         "start": 0.01,
-        "tuned": 0.02,
-        "interval": [0.015, 0.03],
-        "written": 0.04,
-        "moved": "x 2",
-        "change": 2.0,
+        "tuned": 0.04,
+        "searched": 0.02,
+        "interval": [0.03, 0.06],
+        "moved": "x 4",
+        "change": 4.0,
         "left_open": False,
         "would_tell": None,
         "bounds": None,
@@ -152,7 +152,7 @@ def plain():
         row("other", "tuned", 0.4, 1.1, 0.9, 0.9, None, None),
     ]
     shift = number("calibration.clock_offset", logarithm=False, unit="s", start=0.0, tuned=0.001)
-    shift |= {"interval": None, "written": 0.001, "moved": "+0.02 prior sigma", "change": 0.02}
+    shift |= {"interval": None, "searched": 0.001, "moved": "+0.02 prior sigma", "change": 0.02}
     return {
         "schema_version": 1,
         "kind": "jaxekf tuning",
@@ -239,13 +239,14 @@ def test_the_record_is_the_tuning(found, rows, tmp_path):
     assert optical["bounds"] == pytest.approx([1e-3, 0.02])
     assert optical["start"] == pytest.approx(float(found.start.noise.optical))
     read = jaxekf.load_parameters(found.model, tmp_path)
-    assert optical["written"] == pytest.approx(float(read.noise.optical), rel=1e-9)
-    assert optical["written"] / optical["tuned"] == pytest.approx(np.sqrt(found.scale))
+    assert optical["tuned"] == pytest.approx(float(read.noise.optical), rel=1e-9)
+    # In one scale with the interval, and with the change.
+    assert optical["tuned"] / optical["searched"] == pytest.approx(np.sqrt(found.scale))
     assert optical["change"] == pytest.approx(optical["tuned"] / optical["start"])
     own = [n for n in told["numbers"] if n["name"] == "calibration.alignment[1]"]
     assert [n["run"] for n in own] == ["run-0", "run-1"]
     expected = [float(found.each[n["run"]].calibration.alignment[1]) for n in own]
-    assert [n["written"] for n in own] == pytest.approx(expected, rel=1e-9)
+    assert [n["tuned"] for n in own] == pytest.approx(expected, rel=1e-9)
 
 
 def test_how_far_a_bounded_number_moved(found):
@@ -255,8 +256,8 @@ def test_how_far_a_bounded_number_moved(found):
     free[at] += 30.0
     far = replace(found, free=free)
     told = next(n for n in record(far)["numbers"] if n["name"] == "noise.optical")
-    assert told["tuned"] == pytest.approx(0.02, rel=1e-3)
-    assert told["moved"] == far.moved[at] == f"x {0.02 / float(found.start.noise.optical):.3g}"
+    assert told["searched"] == pytest.approx(0.02, rel=1e-3)
+    assert told["moved"] == far.moved[at] == f"x {0.04 / float(found.start.noise.optical):.3g}"
     assert any("at its upper bound" in sentence for sentence in record(far)["warnings"])
 
 
@@ -334,15 +335,15 @@ def worse_fold(document):
         (change(1, change=-3.1), ["clock_offset moved by more than 3 deviations of its prior"]),
         (change(0, bounds=[0.001, 0.05]), []),
         (
-            change(0, bounds=[0.001, 0.0201], written=0.02),
+            change(0, bounds=[0.001, 0.0201], tuned=0.02),
             ["noise.optical is at its upper bound (0.0201 rad)"],
         ),
         (change(1, bounds=[0.0009, 0.1]), ["clock_offset is at its lower bound (0.0009 s)"]),
         (change(1, bounds=[-0.001, 0.1]), []),
         # A number of a wide interval that stayed where it began is not drawn to a bound.
-        (change(1, bounds=[1.0, 1e6], start=100.0, tuned=100.0, written=100.0), []),
+        (change(1, bounds=[1.0, 1e6], start=100.0, tuned=100.0, searched=100.0), []),
         (
-            change(0, bounds=[0.001, 0.03], written=0.04),
+            change(0, bounds=[0.001, 0.03], tuned=0.04),
             ["scale of all covariances (4) took noise.optical past the bounds"],
         ),
         (
@@ -350,6 +351,25 @@ def worse_fold(document):
             ["(4) also holds for noise.gyroscope, not free"],
         ),
         (lambda d: d.update(rejected_steps=1), ["1 step was not finite"]),
+        (lambda d: d.update(accepted={"optical": [95, 100]}), []),
+        (
+            lambda d: d.update(accepted={"optical": [17, 100], "markers": [99, 100]}),
+            ["used only a part of the samples (optical: 17 %), since gates rejected"],
+        ),
+        (
+            lambda d: d.update(accepted={"optical": [17, 100]}, gates_off=True),
+            ["gates accept only a part of the samples (optical: 17 %); they were off"],
+        ),
+        (
+            lambda d: d.update(accepted={"optical": [99, 100]}, gates_off=True),
+            ["Gates rejected over 10 % of a sensor's samples at the start"],
+        ),
+        (
+            change(0, interval=[0.0, 0.05]),
+            ["no lower limit to noise.optical: 0 to 0.05 rad (95 %)"],
+        ),
+        (change(0, interval=[0.03, None]), ["no upper limit to noise.optical: 0.03 rad or more"]),
+        (change(1, interval=[-0.001, 0.002]), []),
         (lambda d: d.update(stopped="the 9 iterations asked for are done"), ["ask for more"]),
         (lambda d: d.update(stopped="no improvement in 15 iterations"), []),
         (alone, ["No run was held out: the tuning was compared on the training runs themselves"]),
@@ -430,9 +450,9 @@ def test_what_stands_in_the_tables(read):
     """Would catch radians called degrees, a start that is the tuned value, a lost variant, or markup."""
     text = "|".join(t for t in read.text if t.strip())
     assert "A warning </script><script>throw 1</script>" in text and "b" not in read.tags
-    # start, tuned, interval, unit, move and what is written, in degrees
-    assert "noise.optical|0.57296|1.1459|0.85944|1.7189|deg|× 2|2.2918" in text
-    assert "calibration.clock_offset|0|0.001|–|–|s|+0.02 σ of the prior|0.001" in text
+    # start, tuned, interval, unit and move, in degrees
+    assert "noise.optical|0.57296|2.2918|1.7189|3.4377|deg|× 4" in text
+    assert "calibration.clock_offset|0|0.001|–|–|s|+0.02 σ of the prior" in text
     assert "as given|–|0|lost|drawn 1|1.5|7|won" in text
     assert "validation runs (held out)" in text
     assert "the training runs themselves (not held out)" in text
@@ -536,9 +556,9 @@ def test_intervals_are_multiples_of_the_start():
     figure = tuning_figures.intervals(typed().numbers)
     assert figure is not None
     (trace,) = figure.document["data"]
-    assert trace["x"] == pytest.approx([2.0])
-    assert trace["error_x"]["array"] == pytest.approx([1.0])
-    assert trace["error_x"]["arrayminus"] == pytest.approx([0.5])
+    assert trace["x"] == pytest.approx([4.0])
+    assert trace["error_x"]["array"] == pytest.approx([2.0])
+    assert trace["error_x"]["arrayminus"] == pytest.approx([1.0])
     assert tuning_figures.intervals(typed().numbers[1:]) is None
     assert tuning_figures.intervals(typed().numbers[:1] * 100) is None
 

@@ -1,7 +1,7 @@
 """The tuner: a search over all training runs at once, validated on runs that it does not learn from."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,19 +16,21 @@ from jaxekf.estimation.versions import provenance
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.io.hashes import inputs_of
 from jaxekf.models import adapted, get_model
+from jaxekf.models.robust import outlier_method, robust
 from jaxekf.recordings.types import Recording
 from tuning.objective import covariance_scale
 from tuning.objective.data import prepare_groups
-from tuning.objective.fisher_information import Information, information
+from tuning.objective.fisher_information import Information, accepted_rows
 from tuning.objective.objectives import Objective, as_objective
 from tuning.parametrisation.free_vector import Free, Layout, initial_parameters, layout, scaled
 from tuning.persistence.checkpoint import attach
 from tuning.results.fitted import Fitted
-from tuning.results.tuned import Progress, Tuned
+from tuning.results.tuned import LEAST_SHARE, Limits, Progress, Tuned
 from tuning.search.descent import Descent
 from tuning.search.evaluation import own_step
 from tuning.search.multistart import MultiStart, start_searches
 from tuning.search.optimisers import LBFGS, Optimiser, as_optimiser
+from tuning.search.settling import settle
 
 _OWN_STEPS = 8
 _WARM_STEPS = 12
@@ -51,6 +53,7 @@ def tune(
     smooth: bool = False,
     confidence_intervals: bool = False,
     warm: bool = False,
+    gates_off: bool | None = None,
     optimiser: Optimiser | optax.GradientTransformation | str = LBFGS(),  # noqa: B008
     starts: int = 1,
     batch: int | None = None,
@@ -87,6 +90,10 @@ def tune(
     warm
         Whether to begin with up to 12 steps of Fisher scoring on the likelihood: errors are flat far from
         their minimum (of 20 starts within 1.5 decades 6 came within 1 % of the best, 19 with it).
+    gates_off
+        Whether the model's gates are off during the search. By default if they reject more than a tenth of
+        a sensor's rows at the start: a search sees nothing of rejected samples, and rejecting more of them
+        looks better than explaining them.
     optimiser
         `LBFGS`, `FisherScoring`, `Adam`, or an optimiser of optax. Names and `batch` are deprecated.
     starts, seed
@@ -127,63 +134,60 @@ def tune(
     _check(learnt, validation, where, aim)
     groups = partial(prepare_groups, chosen, burn_in_s=burn_in_s, need_truth=aim.needs_truth)
     data = groups(learnt), groups(validation) if validation else None
-    problem = chosen, aim, where, base, *data, iterations
+    if gates_off is None:
+        free_start = where.to_free(base)
+        gates_off = any(
+            used < LEAST_SHARE * all_rows
+            for used, all_rows in accepted_rows(chosen, where, free_start, base, data[0]).values()
+        )
+    searched = robust(chosen, "none") if gates_off else chosen
+    problem = searched, aim, where, base, *data, iterations
     make = partial(method.search, *problem, starts=starts, seed=seed)
     searches = start_searches(make, starts, seed)
     if checkpoint is not None:
-        limits = iterations, patience, burn_in_s, confidence_intervals, warm
+        limits = iterations, patience, burn_in_s, confidence_intervals, warm, gates_off
         options = _names(learnt), _names(validation), *limits, method, starts, seed
         attach(searches, Path(checkpoint), repr(options))
     if warm:
         searches.warm(_WARM_STEPS)
     search = searches.run(patience, progress)
-    known, stopped = _finish(search, patience, confidence_intervals, progress)
-    tuned = _tuned(searches, search, known, stopped, learnt, validation, rescale)
+    if rescale is None:
+        rescale = covariance_scale.is_open(search.objective, search.training, where)
+    scaling = _scaling(search) if rescale else None
+    settled = settle(search, patience, confidence_intervals, progress, scaling)
+    tuned = _tuned(searches, search, chosen, settled, learnt, validation, scaling)
+    stopped = tuned.stopped
     if checkpoint is not None and "interrupted" not in stopped:
         Path(checkpoint).unlink(missing_ok=True)
     return tuned
 
 
-def _finish(
-    search: Descent, patience: int, confidence_intervals: bool, progress: Progress | None
-) -> tuple[Information | None, str]:
-    """Search, fix unobservable numbers and search on until there are no more; return the information at the
-    end, and the reason for it."""
-    while True:
-        stopped = search.run(patience, progress)
-        if not confidence_intervals:
-            return None, stopped
-        assert search.best is not None
-        known = information(
-            search.model, search.layout, search.best.free, search.base, search.training
-        )
-        search.filterings += search.information_cost
-        fixed = known.open(search.fixed)
-        if (fixed == search.fixed).all() or "interrupted" in stopped:
-            return known, stopped
-        search.restart(fixed)
+def _scaling(search: Descent) -> Callable[[Parameters], float]:
+    """The common scale of all covariances as a function of the parameters."""
+    given, smooth = (search.training, search.layout), search.objective.smoothed
+    return lambda params: covariance_scale.scale(search.model, params, *given, smooth=smooth)
 
 
 def _tuned(
     searches: MultiStart,
     search: Descent,
-    known: Information | None,
-    stopped: str,
+    model: Model,
+    settled: tuple[Information | None, Limits, str],
     learnt: list[Recording],
     validation: list[Recording],
-    rescale: bool | None,
+    scaling: Callable[[Parameters], float] | None,
 ) -> Tuned:
     """Result of a finished search."""
     assert search.best is not None
+    known, limits, stopped = settled
     where, best, runs = search.layout, search.best.step, _names(learnt)
     params, scale = where.from_free(search.best.free, search.base), 1.0
     together = where.together(params)
-    if rescale is None:
-        rescale = covariance_scale.is_open(search.objective, search.training, where)
-    if rescale:
-        smooth = search.objective.smoothed
-        scale = covariance_scale.scale(search.model, params, search.training, where, smooth=smooth)
-        params, together = scaled(params, scale), scaled(together, scale)
+    scaled_base = search.base
+    if scaling is not None:
+        scale = scaling(params)
+        scaled_base = scaled(search.base, scale, search.base)
+        params, together = (scaled(each, scale, search.base) for each in (params, together))
     each = {name: where.one_run(params, i) for i, name in enumerate(runs)} if where.own else {}
     origin = {
         "runs": runs,
@@ -197,14 +201,18 @@ def _tuned(
         "date": datetime.date.today().isoformat(),
         **provenance(),
     }
+    origin["outlier_methods"] = [f"{s.name}: {outlier_method(s)}" for s in model.sensors]
+    if model is not search.model:
+        origin["gates_off"] = True
     if where.own:
         origin["own_of_each_run"] = sorted(where.own)
-    if search.fixed.any():
-        origin["left_open"] = [where.labels()[i] for i in np.flatnonzero(search.fixed)]
+    if left := [i for i in np.flatnonzero(search.fixed) if i not in limits]:
+        origin["left_open"] = [where.labels()[i] for i in left]
     if validation:
         origin["validation_value"] = best.validation
+    written = np.asarray(where.to_free(params))
     return Tuned(
-        model=search.model,
+        model=model,
         params=together._replace(truth=()),
         start=search.base,
         objective=search.objective,
@@ -219,8 +227,10 @@ def _tuned(
         free=np.asarray(search.best.free),
         information=known,
         fixed=search.fixed,
+        limits=limits,
+        accepted=accepted_rows(model, where, written, scaled_base, search.training),
         evaluations=searches.evaluations,
-        filterings=searches.filterings + rescale,
+        filterings=searches.filterings + (scaling is not None),
         starts=searches.outcomes if len(searches.searches) > 1 else (),
         inputs=dict(inputs_of([*learnt, *validation])),
     )

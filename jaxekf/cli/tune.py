@@ -20,6 +20,7 @@ from jaxekf.cli.console import (
     print_json,
     print_table,
     quiet_option,
+    robust_option,
     sort_option,
     tuning_progress,
     wrote,
@@ -38,11 +39,13 @@ from jaxekf.estimation import parameters
 from jaxekf.filtering.model import Parameters
 from jaxekf.io.atomic import check_output
 from jaxekf.models import get_model
+from jaxekf.models.robust import OutlierMethod, robust
 from jaxekf.recordings.types import Recording
 from tuning.objective.objectives import parse
 from tuning.parametrisation.free_toml import read_free
 from tuning.parametrisation.free_vector import AXES
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
+from tuning.persistence.tuning_document import data_warnings
 from tuning.results.comparison import as_dicts
 from tuning.search.optimisers import NAMED, from_name
 
@@ -63,13 +66,12 @@ _RENAMED = {
 )
 @model_option
 @noise_option
+@robust_option
 @sort_option
-@default_option(
+@click.option(
     "--objective",
-    None,
-    "attitude",
-    "Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
-    " attitude+0.1*likelihood.",
+    help="Objective: attitude, rate, position, truth, likelihood, map, or a weighted sum such as"
+    " attitude+0.1*likelihood.  [default: attitude; map if only calibration is free]",
 )
 @click.option(
     "--free",
@@ -165,8 +167,9 @@ def tune(
     validate: tuple[Path, ...],
     model: str,
     noise_files: tuple[str, ...],
+    outlier_method: OutlierMethod | None,
     sort: bool,
-    objective: str,
+    objective: str | None,
     free: tuple[str, ...],
     own: tuple[str, ...],
     spec: Path | None,
@@ -188,14 +191,14 @@ def tune(
     The start is --noise, or the model's defaults. --folds first shows the errors on held-out runs.
     """
     check_folds(folds, baselines, static)
-    chosen = get_model(model)
+    chosen = get_model(model) if outlier_method is None else robust(model, outlier_method)
     check_output(output, "noise.toml", overwrite=overwrite)
     start = parameters.load(chosen, *noise_files)
-    aim = parse(objective)
     training = load_runs(runs, sort=sort, model=chosen)
     validation = load_runs(validate, sort=sort, model=chosen)
     chosen_free = [*free, *(read_free(spec) if spec else ())]
     chosen_free += [tuning.Free(name, each_run=True) for name in own]
+    aim = parse(objective or _default_objective(chosen_free))
     for run in training + validation if aim.needs_truth else ():
         if run.encoder is None:
             note(f"run '{run.name}' has no encoder and does not count in the error")
@@ -208,6 +211,8 @@ def tune(
         "start": start,
         "optimiser": from_name(optimiser, batch),
         "burn_in_s": burn_in,
+        # A method that was asked for holds, whatever it rejects.
+        "gates_off": None if outlier_method is None else False,
         "warm": aim.errors_alone and optimiser != "adam" if warm is None else warm,
     }
     unseen = None
@@ -238,6 +243,12 @@ def tune(
     _print(tuned, rows, "validation runs" if validation else "the training runs")
 
 
+def _default_objective(free: list[str | tuning.Free]) -> str:
+    """The objective unless one is given: innovations determine calibration better than attitude errors."""
+    names = [one.name if isinstance(one, tuning.Free) else one for one in free]
+    return "map" if names and all(n.startswith("calibration") for n in names) else "attitude"
+
+
 def _print(tuned: tuning.Tuned, rows: list[tuning.Row], runs: str) -> None:
     """The tables of a tuning."""
     _print_noise(tuned)
@@ -250,6 +261,8 @@ def _print(tuned: tuning.Tuned, rows: list[tuning.Row], runs: str) -> None:
 def _note(tuned: tuning.Tuned, output: Path) -> None:
     """Print the output folder, the end of the search, and unobservable parameters."""
     wrote(output / "noise.toml")
+    for sentence in data_warnings(tuned):
+        note(sentence)
     note(f"{tuned.stopped}, best at iteration {tuned.best.number}")
     if tuned.rejections:
         note(f"{tuned.rejections} steps were not finite and were rejected")
@@ -305,7 +318,7 @@ def _print_known(tuned: tuning.Tuned) -> None:
     for label, ends in tuned.intervals.items():
         rows.append([label, *(f"{end:.5g}" for end in ends), first[label]])
     print_table(
-        "Confidence intervals (SI, before the final scaling of Q, R and P0)",
+        "Confidence intervals (SI)",
         ["number", "tuned", "95 %: from", "to", "moved by"],
         rows,
     )

@@ -131,17 +131,21 @@ def judge_fault(sensor: str, nis: Consistency, fault: Fault) -> Verdict:
         )
     elif fault.kind == "gyroscope_bias":
         worth = float(np.linalg.norm(size))
-        each = ", ".join(f"{x:.3f}" for x in np.rad2deg(size))
+        each = ", ".join(
+            f"{x:.3f} ± {s:.3f}" for x, s in zip(np.rad2deg(size), np.rad2deg(sigma), strict=True)
+        )
         sentence = (
             f"innovations of {sensor} have the mean of a gyroscope bias error of ({each}) deg/s: the bias"
             " is fixed, or its random walk or initial deviation is too small; increase them"
         )
     else:
-        worth = float(np.abs(size).max())
+        at = int(np.argmax(np.abs(size) / np.maximum(sigma, np.finfo(float).tiny)))
+        worth = float(np.abs(size[at]))
+        row, column = divmod(at, 3)
         sentence = (
             f"innovations of {sensor} follow the integrated rate as with a gyroscope matrix error of"
-            f" {100 * worth:.1f} %: check scale and misalignment of the gyroscope, and tune the"
-            " calibration"
+            f" {100 * size[at]:.2f} ± {100 * sigma[at]:.2f} % in element {'xyz'[row]}{'xyz'[column]}: check"
+            " scale and misalignment of the gyroscope, and tune the calibration"
         )
     return Verdict(fault.kind, sensor, nis.factor, worth, fault.unit, sentence)
 

@@ -57,6 +57,12 @@ def robust(model: str | Model, outlier_method: OutlierMethod, probability: float
     return _robust(get_model(model), outlier_method, probability)
 
 
+def outlier_method(sensor: Sensor) -> str:
+    """The outlier method of a sensor, one of `OUTLIER_METHODS`."""
+    one = sensor.single_group or sensor
+    return str(one.weighting or sensor.weighting or ("gate" if one.gate or sensor.gate else "none"))
+
+
 @remembered
 def _robust(model: Model, outlier_method: OutlierMethod, probability: float) -> Model:
     is_weight = outlier_method in ("huber", "student")

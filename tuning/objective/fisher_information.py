@@ -6,7 +6,7 @@ differences of the filter itself: two runs of it for each parameter, all recorde
 the prior it gives Laplace's approximation of the posterior.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -65,19 +65,31 @@ class Information:
         """(n,) posterior deviations."""
         return np.sqrt(np.diagonal(self.posterior(fixed)))
 
+    def wide(self, fixed: Flags | None = None) -> Flags:
+        """(n,) numbers that the curvature does not determine, `fixed` and the encoder's left out."""
+        share = self.sigma(fixed) / np.asarray(self.layout.prior)
+        return np.where(self.layout.is_truth, 0.0, share) > OPEN
+
+    def least_known(self, fixed: Flags, kept: Flags) -> int | None:
+        """The least known number that is neither fixed nor kept; None if the others are determined.
+
+        `kept` numbers stay free. Numbers of the encoder are left out: they are determined by errors, not by
+        measurements.
+        """
+        share = self.sigma(fixed & ~kept) / np.asarray(self.layout.prior)
+        share = np.where(self.layout.is_truth | fixed | kept, 0.0, share)
+        worst = int(np.argmax(share))
+        return worst if share[worst] > OPEN else None
+
     def open(self, fixed: Flags | None = None) -> Flags:
-        """(n,) numbers that the measurements do not determine, `fixed` included.
+        """(n,) numbers that the curvature does not determine, `fixed` included.
 
         They are fixed one after the other, the least known first: if only the sum of two is known, one is
-        enough. Numbers of the encoder are left out: they are determined by errors, not by measurements.
+        enough.
         """
         found = np.zeros(len(self.free), bool) if fixed is None else fixed.copy()
-        prior = np.asarray(self.layout.prior)
-        while not found.all():
-            left = np.where(self.layout.is_truth, 0.0, self.sigma(found) / prior)
-            worst = int(np.argmax(left))
-            if left[worst] <= OPEN:
-                break
+        none = np.zeros_like(found)
+        while (worst := self.least_known(found, none)) is not None:
             found[worst] = True
         return found
 
@@ -160,6 +172,28 @@ def _innovations(
     return found, jnp.sum(likelihood, axis=(1, 2))
 
 
+def accepted_rows(
+    model: Model, where: Layout, free: Any, base: Parameters, groups: Sequence[Data]
+) -> dict[str, tuple[int, int]]:
+    """Measured rows that pass the gates at a free vector, and all that are visible, by sensor; empty for a
+    model without gates."""
+    gates = any(s.gate or (s.single_group and s.single_group.gate) for s in model.sensors)
+    found: dict[str, tuple[int, int]] = {}
+    for data in groups if gates else ():
+        local = np.asarray(free, float)[where.index(np.asarray(data.place))]
+        measured, _ = _innovations(model, where.of_one_run(), local, base=base, data=data)
+        rows = data.steps.fast | data.steps.slow
+        for name, (_, _, used) in measured.items():
+            counted = data.counted if name in data.steps.fast else data.counted[:, :, -1]
+            mask = np.asarray(rows[name].mask)
+            visible = mask & np.asarray(counted).reshape(
+                counted.shape + (1,) * (mask.ndim - counted.ndim)
+            )
+            before = found.get(name, (0, 0))
+            found[name] = before[0] + int(np.sum(used)), before[1] + int(visible.sum())
+    return found
+
+
 _MORE = {
     "noise.bias_walk": "recordings of some minutes",
     "noise.accelerometer_walk": "recordings of some minutes",
@@ -182,16 +216,21 @@ def informative_motion(name: str) -> str:
     return _MORE.get(name, _MORE.get(name.split(".")[0], "longer recordings with more motion"))
 
 
-def interval(layout: Layout, free: Any, sigma: Any) -> list[tuple[float, float, float]]:
+def interval(
+    layout: Layout, free: Any, sigma: Any, limits: Mapping[int, tuple[float, float]] | None = None
+) -> list[tuple[float, float, float]]:
     """Value and 95 % interval of each free number, in the parameter's unit.
 
     For a logarithm it is the interval of the value itself; below the diagonal of a full matrix that of the
-    entry divided by the diagonal one of its row.
+    entry divided by the diagonal one of its row. `limits` holds, for some numbers, the distances to the
+    lower and the upper end, which replace those of the deviation `sigma`.
     """
     found = []
-    for (leaf, i), value, deviation in zip(layout.numbers(), free, sigma, strict=True):
+    each = zip(layout.numbers(), free, sigma, strict=True)
+    for number, ((leaf, i), value, deviation) in enumerate(each):
         half = _Z95 * float(deviation)
-        ends = [leaf.unbounded(float(value) + off, i) for off in (0.0, -half, half)]
+        below, above = (limits or {}).get(number, (half, half))
+        ends = [leaf.unbounded(float(value) + off, i) for off in (0.0, -below, above)]
         if leaf.is_logarithm(i):
             ends = [float(np.exp(end)) for end in ends]
         elif leaf.kind == "linear":

@@ -25,6 +25,8 @@ from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
 _NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
 # Standard deviations of weak priors by unit.
 _WEAK = {"s": 0.05, "1": 0.05, "rad": 0.1, "m": 0.05, "s/s": 2e-4}
+# A given prior has the same share for its step, but at most this one.
+_LONGEST_SHARE = 0.5
 AXES = ("tied", "each", "full")
 
 
@@ -236,18 +238,19 @@ def layout(
 
 def _leaf(name: str, value: Any, unit: str, entry: Free, runs: int) -> Leaf:
     linear = name.startswith(("calibration.", "truth."))
-    step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
     if not linear:
         _check_positive(name, value)
     kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
-    prior = entry.prior
-    if prior is None:
-        prior = _WEAK.get(unit, step) if linear else WEAK_LOG
+    weak = _WEAK.get(unit, 1.0) if linear else WEAK_LOG
+    prior = weak if entry.prior is None else entry.prior
     if not 0.0 < prior < np.inf:
         raise TuningError(
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
             " for a weak one"
         )
+    step = _NATURAL_STEP.get(unit, 1.0) if linear else 1.0
+    if linear and entry.prior is not None:
+        step = prior * min(step / weak, _LONGEST_SHARE)
     leaf = Leaf(name, value.shape, kind, step, runs if entry.each_run else 0, prior / step)
     bounds = _bounds(name, value, kind, step, entry.bounds)
     if bounds is None:
@@ -342,8 +345,11 @@ SCALED = ("noise.", "initial.")
 """The sections that `scaled` scales."""
 
 
-def scaled(params: Parameters, factor: float) -> Parameters:
+def scaled(params: Parameters, factor: float, start: Parameters | None = None) -> Parameters:
     """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales.
+
+    With `start` no initial deviation falls below the one there. The scale comes from errors long after the
+    beginning of a run; a bias that the next run begins with may be as large as before.
 
     Examples
     --------
@@ -353,7 +359,14 @@ def scaled(params: Parameters, factor: float) -> Parameters:
     2.0
     """
     root = np.sqrt(factor)
-    return params._replace(
-        noise=jax.tree.map(lambda a: a * root, arguments.float_leaves("noise", params.noise)),
-        initial=jax.tree.map(lambda a: a * root, arguments.float_leaves("initial", params.initial)),
-    )
+    own = arguments.float_leaves("initial", params.initial)
+    noise = jax.tree.map(lambda a: a * root, arguments.float_leaves("noise", params.noise))
+    initial = jax.tree.map(lambda a: a * root, own)
+    if start is not None:
+        initial = jax.tree.map(
+            lambda new, a, first: jnp.maximum(new, jnp.minimum(a, first)),
+            initial,
+            own,
+            start.initial,
+        )
+    return params._replace(noise=noise, initial=initial)

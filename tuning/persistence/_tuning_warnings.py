@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from tuning.results.tuned import LEAST_SHARE
+
 CONSISTENT_NEES = (0.5, 2.0)
 """Range of the attitude NEES of a held-out run with a consistent filter."""
 _FAR_FACTOR = 10.0
@@ -21,9 +23,11 @@ _COLUMNS = {
 def cautions(record: Mapping[str, Any]) -> list[str]:
     """Sentences that a reader of a record should know before using its numbers; empty if there are none."""
     checks: tuple[Callable[[Mapping[str, Any]], Iterable[str]], ...] = (
+        _rejected,
         _unseen,
         _ended,
         _left_open,
+        _one_sided,
         _far,
         _bounded,
         _scaled,
@@ -33,12 +37,55 @@ def cautions(record: Mapping[str, Any]) -> list[str]:
     return [sentence for check in checks for sentence in check(record)]
 
 
+def on_data(record: Mapping[str, Any]) -> list[str]:
+    """The sentences on rejected samples, and on numbers that the data limit to one side only."""
+    return [*_rejected(record), *_one_sided(record)]
+
+
 def before(rows: Sequence[Mapping[str, Any]]) -> str:
     """Name of the variant before the tuning: ``start``, or the first that is neither `hold last` nor tuned;
     empty if there is none."""
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     others = [name for name in variants if name not in ("hold last", "tuned")]
     return "start" if "start" in variants else others[0] if others else ""
+
+
+def _rejected(record: Mapping[str, Any]) -> Iterable[str]:
+    shares = {
+        name: used / visible
+        for name, (used, visible) in record.get("accepted", {}).items()
+        if visible
+    }
+    low = [f"{name}: {100 * s:.3g} %" for name, s in shares.items() if s < LEAST_SHARE]
+    if low and record.get("gates_off"):
+        yield (
+            f"With the tuned parameters the gates accept only a part of the samples ({_listed(low)}); they"
+            " were off during the search: look for outliers, or for what else this model leaves out"
+        )
+    elif low:
+        yield (
+            f"The tuning used only a part of the samples ({_listed(low)}), since gates rejected the rest:"
+            " tune with the outlier method none, and free the calibration that may be wrong"
+        )
+    elif record.get("gates_off"):
+        yield (
+            f"Gates rejected over {100 * (1 - LEAST_SHARE):.0f} % of a sensor's samples at the start, so"
+            " that they were off during the search: outliers, if any, count in the tuned noise"
+        )
+
+
+def _one_sided(record: Mapping[str, Any]) -> Iterable[str]:
+    for number in record["numbers"]:
+        if number["interval"] is None:
+            continue
+        low, high = number["interval"]
+        unit = "" if number["unit"] == "1" else f" {number['unit']}"
+        no_low = low is None or (number["logarithm"] and low == 0.0)
+        if no_low and high is not None:
+            shown = f"0 to {high:.3g}" if number["logarithm"] else f"up to {high:.3g}"
+            yield f"The data give no lower limit to {called(number)}: {shown}{unit} (95 %)"
+        elif high is None and not no_low:
+            yield f"The data give no upper limit to {called(number)}: {low:.3g}{unit} or more (95 %)"
 
 
 def _unseen(record: Mapping[str, Any]) -> Iterable[str]:
@@ -94,7 +141,7 @@ def _far(record: Mapping[str, Any]) -> Iterable[str]:
 
 def _bounded(record: Mapping[str, Any]) -> Iterable[str]:
     for number in record["numbers"]:
-        bounds, value = number["bounds"], number["tuned"]
+        bounds, value = number["bounds"], _searched(number)
         if bounds is None or value is None:
             continue
         for bound, which in zip(bounds, ("lower", "upper"), strict=True):
@@ -114,10 +161,10 @@ def _scaled(record: Mapping[str, Any]) -> Iterable[str]:
     factor = record["covariance_scale"]
     past = []
     for number in record["numbers"]:
-        bounds, value = number["bounds"], number["written"]
+        bounds, value = number["bounds"], number["tuned"]
         if bounds is None or value is None:
             continue
-        if not bounds[0] <= value <= bounds[1] and bounds[0] <= number["tuned"] <= bounds[1]:
+        if not bounds[0] <= value <= bounds[1] and bounds[0] <= _searched(number) <= bounds[1]:
             past.append(called(number))
     if past:
         yield (
@@ -178,6 +225,12 @@ def _pairs(rows: Sequence[Mapping[str, Any]], column: str) -> Iterable[tuple[str
         first, last = found.get((run, first_of)), found.get((run, "tuned"))
         if first is not None and last is not None:
             yield run, first, last
+
+
+def _searched(number: Mapping[str, Any]) -> Any:
+    """The number before the common scale of all covariances."""
+    found = number.get("searched")
+    return number["tuned"] if found is None else found
 
 
 def called(number: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from tuning.objective.fisher_information import interval
 from tuning.parametrisation.free_vector import SCALED
 from tuning.parametrisation.leaf import Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
-from tuning.persistence._tuning_warnings import cautions
+from tuning.persistence._tuning_warnings import cautions, on_data
 from tuning.results.comparison import Row, as_dicts
 from tuning.results.held_out import CrossValidation
 from tuning.results.tuned import Tuned
@@ -49,8 +49,10 @@ def record(
 
     `rows` come from `compare` with the variants ``start`` and ``tuned``, `folds` from `cross_validate`.
     `judged_on` is the kind of the rows' runs, found by their names unless given. ``numbers`` holds each
-    free number: ``tuned`` and ``interval`` (95 %) before the common scale, ``written`` as in the parameter
-    files; ``change`` is a factor for logarithms, else in prior deviations. ``history`` has
+    free number: ``tuned`` and ``interval`` (95 %; None for an end that the data do not give) as in the
+    parameter files, ``searched`` before the common scale of all covariances; ``change`` is a factor for
+    logarithms, else in prior deviations. ``accepted`` has the rows of each sensor that pass the gates with
+    these parameters, and all visible ones. ``history`` has
     the values of the objective, step by step, for the best of several ``starts``.
 
     Raises `TuningError` if `judged_on` contradicts the names of the runs.
@@ -73,6 +75,8 @@ def record(
         "rejected_steps": int(tuned.rejections),
         "covariance_scale": float(tuned.scale),
         "also_scaled": _also_scaled(tuned),
+        "accepted": {name: list(rows) for name, rows in tuned.accepted.items()},
+        "gates_off": bool(origin.get("gates_off", False)),
         "history": [step._asdict() for step in tuned.history],
         "best_iteration": int(tuned.best.number),
         "starts": [outcome._asdict() for outcome in tuned.starts],
@@ -85,6 +89,11 @@ def record(
     }
     found = codec.plain(found)
     return found | {"warnings": cautions(found)}
+
+
+def data_warnings(tuned: Tuned) -> list[str]:
+    """Warnings of `record` on rejected samples, and on numbers that the data limit to one side only."""
+    return on_data(record(tuned))
 
 
 def save_record(
@@ -200,7 +209,6 @@ def _numbers(tuned: Tuned) -> list[dict[str, Any]]:
     found = []
     for (leaf, i), label, (first, *_), (last, *_), moved, change in each:
         logarithm, run, ends = leaf.is_logarithm(i), i // leaf.each, known.get(label)
-        scales = logarithm and leaf.name.startswith(SCALED)
         found.append(
             {
                 "label": label,
@@ -210,9 +218,9 @@ def _numbers(tuned: Tuned) -> list[dict[str, Any]]:
                 "unit": units[leaf.name] if logarithm or leaf.kind == "linear" else "1",
                 "logarithm": logarithm,
                 "start": first,
-                "tuned": last,
+                "tuned": last * tuned.written_factor(leaf, i),
+                "searched": last,
                 "interval": None if ends is None else list(ends[1:]),
-                "written": last * (np.sqrt(tuned.scale) if scales else 1.0),
                 "moved": moved,
                 "change": change,
                 "left_open": label in unknown,

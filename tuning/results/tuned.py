@@ -1,23 +1,26 @@
 """Result of a tuning by gradient."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import tuning
 from jaxekf._support.deprecations import warn_renamed
 from jaxekf.estimation.batch import Run, read
+from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Flags, Floats
 from tuning.objective.fisher_information import Information, informative_motion, interval
 from tuning.objective.objectives import Objective
-from tuning.parametrisation.free_vector import Layout
+from tuning.parametrisation.free_vector import SCALED, Layout, scaled
+from tuning.parametrisation.leaf import Leaf
 from tuning.parametrisation.truth_frame import TruthFrame
 
 
@@ -45,6 +48,11 @@ class Iteration(NamedTuple):
     """Whether the objective or its gradient was not finite; then the step was shortened."""
 
 
+Limits = Mapping[int, tuple[float, float]]
+"""Distances from a free number to the ends of its 95 % interval, by its index; infinite where the data give
+no limit."""
+LEAST_SHARE = 0.9
+"""Share of a sensor's rows below which a tuning warns of its gates."""
 Progress = Callable[[Iteration, int], None]
 
 
@@ -111,7 +119,11 @@ class Tuned:
     information: Information | None = None
     """Fisher information at the best; None if it was not asked for."""
     fixed: Flags = field(default_factory=lambda: np.zeros(0, bool))
-    """(n,) unobservable numbers, which kept their initial values."""
+    """(n,) numbers that kept their initial values, since going back to them costs nothing."""
+    limits: Limits = field(default_factory=dict)
+    """Numbers that the data limit to one side at most, or whose interval follows the objective itself."""
+    accepted: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """Rows that pass the gates with `params`, and all visible ones, by sensor; empty without gates."""
     evaluations: int = 0
     """Evaluations of the objective with its gradient, from all starts; of Adam passes over all runs."""
     filterings: float = 0.0
@@ -138,21 +150,41 @@ class Tuned:
     def intervals(self) -> dict[str, tuple[float, float, float]]:
         """Value and 95 % confidence interval of each observable free number by its label, in its unit.
 
-        The intervals are Laplace's, from innovations and prior, before the scale.
+        The intervals are Laplace's, from innovations and prior, in the scale of `params`; where the
+        likelihood is flat to one side the end is that of the likelihood itself: 0 for a deviation without a
+        lower limit, infinite without an upper one.
         """
         if self.information is None:
             return {}
         sigma = self.information.sigma(self.fixed)
-        ends = interval(self.layout, self.free, sigma)
-        unknown = self.fixed | self.layout.is_truth
-        every = zip(self.layout.labels(), ends, unknown, strict=True)
-        return {label: found for label, found, out in every if not out}
+        ends = interval(self.layout, self.free, sigma, self.limits)
+        open_ones = set(self.open)
+        found = {}
+        for label, (leaf, i), each in zip(
+            self.layout.labels(), self.layout.numbers(), ends, strict=True
+        ):
+            if label not in open_ones and not leaf.name.startswith("truth."):
+                factor = self.written_factor(leaf, i)
+                found[label] = (each[0] * factor, each[1] * factor, each[2] * factor)
+        return found
+
+    def written_factor(self, leaf: Leaf, number: int) -> float:
+        """Factor from a number of the search to that of `params`: the common scale of covariances."""
+        if self.scale == 1.0 or not leaf.is_logarithm(number) or not leaf.name.startswith(SCALED):
+            return 1.0
+        if not leaf.name.startswith("initial."):
+            return float(np.sqrt(self.scale))
+        before = self.layout.from_free(jnp.asarray(self.free), self.start)
+        each = (scaled(before, self.scale, self.start), before)
+        after, first = (np.ravel(leaves_by_name(params)[leaf.name])[number] for params in each)
+        return float(after / first)
 
     @property
     def open(self) -> dict[str, str]:
-        """Unobservable numbers by label, each with the recordings that would make it observable."""
+        """Unobservable numbers by label, each with the recordings that would make it observable: the
+        likelihood is flat to both sides of them."""
         labels = self.layout.labels()
-        found = [labels[i] for i in np.flatnonzero(self.fixed)]
+        found = [labels[i] for i in np.flatnonzero(self.fixed) if i not in self.limits]
         return {
             label: informative_motion(label.split("[")[0].split(" of run")[0]) for label in found
         }
@@ -168,11 +200,15 @@ class Tuned:
 
     @property
     def changes(self) -> list[float]:
-        """Change of each free number from its start: a factor of a logarithm, else in prior deviations."""
+        """Change of each free number from its start to `params`: a factor of a logarithm, else in prior
+        deviations."""
         start, found = np.asarray(self.layout.to_free(self.start)), []
         for (leaf, i), first, last in zip(self.layout.numbers(), start, self.free, strict=True):
             change = leaf.unbounded(last, i) - leaf.unbounded(first, i)
-            found.append(float(np.exp(change)) if leaf.is_logarithm(i) else change / leaf.prior)
+            if leaf.is_logarithm(i):
+                found.append(float(np.exp(change)) * self.written_factor(leaf, i))
+            else:
+                found.append(change / leaf.prior)
         return found
 
     def of_run(self, run: Run) -> Parameters:

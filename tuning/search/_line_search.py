@@ -12,6 +12,10 @@ from jaxekf.recordings.types import Floats
 _MOST_REJECTIONS = 10
 _SMALL_GAIN = 1e-5
 _LONGEST_STEP = 1.0
+_FIRST_STEP = 0.1
+_WORTH = 30.0
+"""Gain that the next step must promise after small ones, as a multiple of `LineSearch.least`."""
+_MOST_SMALL_GAINS = 6
 _LBFGS = optax.chain(optax.scale_by_lbfgs(), optax.scale(-1.0))
 # Not compiled as a whole it is some eighty programs, two of which are compiled anew at each step.
 _lbfgs_begin, _lbfgs_step = jax.jit(_LBFGS.init), jax.jit(_LBFGS.update)
@@ -25,7 +29,7 @@ class LineSearch:
     objective falls, and no number moves by more than `_LONGEST_STEP` (an e-fold for a logarithm). The
     steps of another optax optimiser are taken as they are, unless they are not finite. A `direction`, a
     function of the accepted point and its gradient, replaces that of L-BFGS. Two gains in a row of less
-    than `least`, by default a small part of the value, end the search.
+    than `least`, by default a small part of the value, end the search unless the next step promises more.
 
     Only the optimiser's own arithmetic is compiled: the rest, of a few numbers, is done on the host.
     """
@@ -65,9 +69,8 @@ class LineSearch:
         relative = _SMALL_GAIN * max(abs(value), _SMALL_GAIN)
         small = self.value - value < (relative if self.least is None else self.least)
         self.small_gains = self.small_gains + 1 if small and self.monotone else 0
-        if self.small_gains >= 2:
-            return "converged"
         self.rejections = 0
+        first = not np.isfinite(self.value)
         self.accepted, self.value, self.gradient = self.candidate, value, gradient
         if self.direction is None:
             given = jax.device_put((gradient, self.state, self.accepted))
@@ -79,11 +82,21 @@ class LineSearch:
             if float(self.change @ gradient) >= 0.0:
                 self.change = -gradient
             longest = float(np.max(np.abs(self.change)))
-            if longest == 0.0:
+            if longest == 0.0 or self._at_the_end(gradient):
                 return "converged"
-            self.change = self.change * min(1.0, _LONGEST_STEP / longest)
+            # The first direction of L-BFGS has the size of the gradient, which has no scale.
+            shortest = _FIRST_STEP if self.direction is None and first else 0.0
+            self.change = self.change * (min(max(longest, shortest), _LONGEST_STEP) / longest)
         self.candidate = self.accepted + self.change
         return ""
+
+    def _at_the_end(self, gradient: Floats) -> bool:
+        """Whether two steps gained little and the next, scaled by the curvature, would not gain much."""
+        if self.small_gains < 2:
+            return False
+        expected = -0.5 * float(self.change @ gradient)
+        worth = np.inf if self.least is None else _WORTH * self.least
+        return expected < worth or self.small_gains >= _MOST_SMALL_GAINS
 
     def state_dict(self) -> dict[str, Any]:
         """State as arrays by name."""

@@ -101,6 +101,11 @@ class MinibatchDescent(Descent):
         self._begin(self.fallback.free, RATE)
         self.halved = len(self.history)
 
+    def probe(self, free: Any) -> float:
+        """Objective of all runs at a point of no search."""
+        self.filterings += 1
+        return self.value(free)
+
     def _step(self, patience: int, progress: Progress | None) -> str:
         while len(self.history) < self.iterations or self.done:
             # With steps done it goes on in the middle of a pass, whose start is validated already.

@@ -16,7 +16,18 @@ from tuning.search._line_search import LineSearch
 from tuning.search.evaluation import Evaluation, on_host
 
 _IMPROVEMENT = 1e-4
-_STATE = ("last_improvement", "iterations", "evaluations", "filterings", "fixed", "stopped")
+_STATE = (
+    "last_improvement",
+    "iterations",
+    "evaluations",
+    "filterings",
+    "fixed",
+    "stopped",
+    "kept",
+    "jumps",
+)
+_ERROR_SHARE = 5e-3
+"""Share of a mean squared error that counts as one unit of log-likelihood."""
 _LEAST_EVIDENCE = 3e-3
 """Gain of log-likelihood, of all rows together, that is not worth another step."""
 
@@ -26,6 +37,15 @@ class Best(NamedTuple):
 
     free: Any
     step: Iteration
+
+
+class Trial(NamedTuple):
+    """The search as it was before some numbers were fixed to see what that costs."""
+
+    best: Best
+    fixed: Flags
+    last: int
+    """The number that was added last."""
 
 
 @dataclass
@@ -50,6 +70,9 @@ class Descent(Evaluation):
         self.line_search = self._line_search(self.start)
         self.last_improvement = 0
         self.fallback: Best | None = None
+        self.trial: Trial | None = None
+        self.kept = np.zeros(len(self.start), bool)
+        self.jumps = 0
 
     def _line_search(self, free: Any) -> LineSearch:
         # A small part of the mean of a likelihood would be a large part of the evidence for a parameter.
@@ -107,6 +130,33 @@ class Descent(Evaluation):
         """Begin at another point than the start; the prior stays about the start."""
         self.line_search = self._line_search(free)
 
+    @property
+    def evidence(self) -> float:
+        """Change of the objective that is worth one unit of log-likelihood."""
+        weight = (self.objective.likelihood + self.objective.truth) / self.rows
+        if weight and not self.objective.errors:
+            return weight
+        value = 1.0 if self.best is None else abs(self.best.step.training)
+        return max(weight, _ERROR_SHARE * value)
+
+    def probe(self, free: Any) -> float:
+        """Objective of the training runs at a point of no search, by a program that is compiled already."""
+        if not self.fisher:
+            return self.value_and_gradient(free)[0]
+        self.filterings += 1
+        return self.value(free)
+
+    def jump(self, free: Any) -> None:
+        """Go on from a point that is better than the best so far."""
+        self.begin_at(free)
+        self.jumps += 1
+        self._go_on()
+
+    def _go_on(self) -> None:
+        self.last_improvement, self.stopped = len(self.history), ""
+        # Enough to recover after a few numbers moved at once.
+        self.iterations = max(self.iterations, len(self.history) + 10)
+
     def restart(self, fixed: Flags) -> None:
         """Go on from the best with more numbers fixed at their initial values."""
         assert self.best is not None
@@ -114,10 +164,27 @@ class Descent(Evaluation):
         free = np.where(fixed, self.start, on_host(self.best.free))
         self.line_search = self._line_search(free)
         self.fallback = self.best._replace(free=free)
-        self.best, self.last_improvement = None, len(self.history)
-        self.stopped = ""
-        # Enough to recover after a few numbers went back to their initial values.
-        self.iterations = max(self.iterations, len(self.history) + 10)
+        self.best = None
+        self._go_on()
+
+    def try_fixing(self, fixed: Flags, last: int) -> None:
+        """`restart`; `judge_trial` decides whether these numbers stay fixed."""
+        assert self.best is not None
+        self.trial = Trial(self.best, self.fixed, last)
+        self.restart(fixed)
+
+    def judge_trial(self, bound: Callable[[int], float]) -> None:
+        """End a trial: keep its result, or go back if fixing its numbers cost more than `bound` of their
+        count, in log-likelihood; the last of them is then kept."""
+        if self.trial is None:
+            return
+        best, fixed, last = self.trial
+        assert self.best is not None
+        allowed = bound(int(self.fixed.sum() - fixed.sum())) * self.evidence
+        self.trial = None
+        if self.best.step.training - best.step.training > allowed:
+            self.best, self.fixed = best, fixed
+            self.kept[last] = True
 
     def _step(self, patience: int, progress: Progress | None) -> str:
         while len(self.history) < self.iterations:
@@ -210,6 +277,11 @@ class Descent(Evaluation):
         }
         if self.own_free is not None:
             found["own_free"] = np.asarray(self.own_free)
+        if self.trial is not None:
+            found["trial_free"] = np.asarray(self.trial.best.free)
+            found["trial_number"] = np.array(self.trial.best.step.number)
+            found["trial_fixed"] = np.asarray(self.trial.fixed)
+            found["trial_last"] = np.array(self.trial.last)
         return found
 
     def beginning(self) -> dict[str, Any]:
@@ -237,3 +309,8 @@ class Descent(Evaluation):
         self.iterations = int(state["iterations"])
         self.own_free = state.get("own_free")
         self.stopped = str(state["stopped"])
+        self.kept, self.jumps = np.array(state["kept"], bool), int(state["jumps"])
+        if "trial_free" in state:
+            before = Best(state["trial_free"], self.history[int(state["trial_number"])])
+            fixed = np.asarray(state["trial_fixed"], bool)
+            self.trial = Trial(before, fixed, int(state["trial_last"]))

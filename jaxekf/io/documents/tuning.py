@@ -40,10 +40,11 @@ class FreeNumber(Struct, kw_only=True):
     logarithm: bool
     start: float | None
     tuned: float | None
-    interval: tuple[float, float] | None
-    """95 %."""
-    written: float | None
-    """Value in the parameter files, after the common scale of all covariances."""
+    """As in the parameter files."""
+    searched: float | None = None
+    """Value before the common scale of all covariances."""
+    interval: tuple[float | None, float | None] | None
+    """95 %, in the scale of `tuned`; None for an end that the data do not give."""
     moved: str
     change: float | None = None
     left_open: bool
@@ -106,6 +107,10 @@ class TuningDocument(Document, kw_only=True):
     rejected_steps: int
     covariance_scale: float
     also_scaled: list[str] = field(default_factory=list)
+    accepted: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Rows that pass the gates with these parameters, and all visible ones, by sensor."""
+    gates_off: bool = False
+    """Whether the gates were off during the search."""
     history: list[Step]
     best_iteration: int
     starts: list[Start]

@@ -265,9 +265,7 @@ def _consistency_band(x_axis: str, y_axis: str) -> list[dict[str, Any]]:
 def intervals(numbers: Sequence[FreeNumber]) -> Figure | None:
     """Value and interval of each tuned logarithm as multiples of its start; None for too many to read."""
     shown = [
-        n
-        for n in numbers
-        if n.logarithm and n.interval and n.start and n.tuned and min(n.interval) > 0
+        n for n in numbers if n.logarithm and n.interval and n.start and n.tuned and all(n.interval)
     ]
     if not shown or len(shown) > _MOST_NUMBERS:
         return None
@@ -316,7 +314,7 @@ def intervals(numbers: Sequence[FreeNumber]) -> Figure | None:
     layout["hovermode"] = "closest"
     caption = (
         "Tuned values and their 95 % intervals as multiples of the start (the dashed line). Unobservable"
-        " parameters are not shown: they keep their initial values."
+        " parameters keep their initial values; they and intervals open to one side are not shown."
     )
     return Figure("intervals", "Confidence intervals", caption, {"data": [trace], "layout": layout})
 

@@ -97,7 +97,6 @@ def tuning_content(section: TuningSection, number: int) -> dict[str, Any]:
         "judged_on": _JUDGED_ON.get(document.judged_on or "", document.judged_on),
         "compared": _compared(document.rows) if document.rows else None,
         "folds": None if document.folds is None else _folds(document, document.folds),
-        "scaled": document.covariance_scale != 1.0,
         "numbers": _numbers(document),
         "truth": None if document.truth is None else _truth(document),
         "origin": _origin(document),
@@ -187,21 +186,19 @@ def _over_folds(document: TuningDocument, folds: FoldsDocument) -> Table:
 
 def _numbers(document: TuningDocument) -> Table:
     """Each free number with its interval."""
-    scaled = document.covariance_scale != 1.0
-    heads = ["parameter", "start", "tuned", "95 %: from", "to", "unit", "moved by"]
-    heads += (["as written"] if scaled else []) + ["remark"]
+    heads = ["parameter", "start", "tuned", "95 %: from", "to", "unit", "moved by", "remark"]
     rows = []
     for number in document.numbers:
         ends = number.interval or (None, None)
-        turned, unit = in_degrees([number.start, number.tuned, *ends, number.written], number.unit)
-        *cells, written = (number_text(value, 5) for value in turned)
+        turned, unit = in_degrees([number.start, number.tuned, *ends], number.unit)
+        cells = [number_text(value, 5) for value in turned]
         remarks = ["unobservable"] if number.left_open else []
         remarks += ["of the encoder"] if number.truth else []
         remarks += [f"of {number.run} alone"] if number.run else []
         moved = number.moved.replace("x ", "× ").replace("prior sigma", "σ of the prior")
         cells = [number.name, *cells, unit_text("" if unit == "1" else unit), moved]
-        rows.append([*cells, *((written,) if scaled else ()), "; ".join(remarks)])
-    return Table(heads, rows, (1, 2, 3, 4, *((7,) if scaled else ())))
+        rows.append([*cells, "; ".join(remarks)])
+    return Table(heads, rows, (1, 2, 3, 4))
 
 
 def _truth(document: TuningDocument) -> Table:

@@ -148,7 +148,8 @@ def mean_nees(error: Floats, cov: Floats) -> float:
 def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
     """Errors (N, 3) of the outputs attitude, rate, position and velocity against the encoder.
 
-    The encoder is compared on the IMU's clock, its stamps less its `latency`. Attitude errors are rotation
+    The encoder is compared on its own clock (the IMU's, unless its section states the tracker's), its
+    stamps less its `latency`. Attitude errors are rotation
     vectors in the body frame, all in SI units. Instants whose nearest encoder
     sample is not scored or not known are NaN.
 
@@ -158,7 +159,7 @@ def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats
         If the run has no encoder.
     """
     encoder, outputs = recording.need_encoder(), estimate.outputs
-    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    time_ns = estimate.clock.to_encoder(estimate.time_ns, recording)
     truth = encoder_at(encoder, time_ns)
     errors: dict[str, Floats] = {}
     if "attitude" in outputs:
@@ -179,7 +180,7 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     Errors count at instants of the estimate whose nearest encoder sample is scored, from `burn_in_s`
     on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
     body's origin in the reference frame. The encoder's stamps, less its `latency`, are taken for those of
-    the IMU's clock.
+    the IMU's clock, or of the tracker's where its section states ``clock = "tracker"``.
 
     Parameters
     ----------
@@ -210,7 +211,7 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     >>> print(f"{found.attitude_rmse_deg:.3f} deg, NEES {found.attitude_nees:.2f}")
     0.094 deg, NEES 0.99
     """
-    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    time_ns = estimate.clock.to_encoder(estimate.time_ns, recording)
     judged = encoder_at(recording.need_encoder(), time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)
     errors = scored_errors(estimate, recording)
@@ -237,7 +238,7 @@ def _with_shifts(found: Score, estimate: Estimated, recording: Recording, settle
     if "attitude" not in outputs or not settled.any():
         return found
     time_ns, q = (
-        estimate.clock.to_imu(estimate.time_ns)[settled],
+        estimate.clock.to_encoder(estimate.time_ns, recording)[settled],
         outputs["attitude"].value[settled],
     )
     shift, sigma = attitude_shift(encoder, time_ns, q)

@@ -252,7 +252,9 @@ def own_errors(
     found = {}
     # The smoother takes more time to compile.
     for name in ("filtered",) if smoke else ("filtered", "smoothed"):
-        made = jaxekf.estimate_many(trials, marg.MODEL, params, smooth=name == "smoothed")
+        made = jaxekf.estimate_many(
+            trials, marg.MODEL, params, smooth=name == "smoothed", clock="tracker"
+        )
         found[name] = [
             scored(one.outputs["attitude"].value, one.time_ns, trial.need_encoder())
             for one, trial in zip(made, trials, strict=True)

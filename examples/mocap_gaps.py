@@ -304,7 +304,8 @@ def main() -> None:
             runs = [recording, *(case.hidden for case in cases)]
             try:
                 whole, *found = [
-                    jaxekf.estimate(run, "loose_pose", parameters_of(run)) for run in runs
+                    jaxekf.estimate(run, "loose_pose", parameters_of(run), clock="tracker")
+                    for run in runs
                 ]
             except jaxekf.JaxekfError as error:
                 print(f"left out: {error}", file=sys.stderr)

@@ -170,6 +170,18 @@ def test_encoder_with_a_latency_of_its_own(estimates):
     assert jaxekf.score(made[0], stated).attitude_rmse_deg == pytest.approx(right, rel=1e-9)
 
 
+def test_encoder_on_the_tracker_clock(estimates):
+    """Truth from the tracker's own cameras compared on the IMU's clock, as soon as an offset is known."""
+    cases, runs, made = estimates
+    late = cases[25][1]
+    encoder = runs[25].need_encoder()
+    same = runs[25].replace(encoder=replace(encoder, time_ns=encoder.time_ns + ns(late)))
+    stated = same.replace(info={"encoder_about": {"clock": "tracker"}})
+    right = jaxekf.score(made[25], runs[25]).attitude_rmse_deg
+    assert jaxekf.score(made[25], same).attitude_rmse_deg > 5.0 * right
+    assert jaxekf.score(made[25], stated).attitude_rmse_deg == pytest.approx(right, rel=1e-6)
+
+
 def test_models_with_one_clock():
     """A clock named where there are not two, or times moved by an offset of zero."""
     run = planted(0)

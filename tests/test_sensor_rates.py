@@ -108,3 +108,24 @@ def test_missing_samples_stay_missing(tmp_path):
     imu = write(tmp_path / "gap", t, turning(t), slow).need_imu()
     assert not np.isin(np.round(1e9 * t[1010:1390]), imu.time_ns).any()
     assert len(imu.time_ns) > len(t) - 420
+
+
+def test_held_values_are_named(tmp_path):
+    """A message for each event with the other sensor's value held, taken for samples of the gyroscope."""
+    t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
+    other = 7e-4 + np.arange(0.0, DURATION_S, 1.0 / 125.0)
+    merged = np.union1d(np.round(t, 9), np.round(other, 9))
+    at = np.searchsorted(t, merged, side="right") - 1
+    run = write(tmp_path / "run", merged, turning(t)[at])
+    (note,) = run.intake["imu"].notes
+    assert "% of the rows repeat the gyroscope" in note
+
+
+@pytest.mark.parametrize("resolution", [1e-3, 0.02, 0.3])
+def test_coarse_values_are_not_held(tmp_path, resolution):
+    """Rows that repeat because the sensor rests, or turns by less than its resolution between samples."""
+    t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
+    rng = np.random.default_rng(3)
+    rate = turning(np.maximum(t - 5.0, 0.0)) + 1e-3 * rng.standard_normal((len(t), 3))
+    run = write(tmp_path / "run", t, resolution * np.round(rate / resolution))
+    assert run.intake["imu"].notes == ()

@@ -54,10 +54,14 @@ figure = scale_figure()
 
 # %%
 # A calibration parameter is constant and not part of the state: it is tuned. With the gyroscope's
-# stamps 10 ms later the tuner finds the offset of its clock, and its 95 % interval.
+# stamps 10 ms later the tuner finds the offset of its clock, and its 95 % interval. The encoder stays on
+# the tracker's clock, which its section of `recording.toml` would state.
 
 late = scaled.need_imu()
-late = scaled.replace(imu=replace(late, time_ns=late.time_ns + 10_000_000))
+late = scaled.replace(
+    imu=replace(late, time_ns=late.time_ns + 10_000_000),
+    info={**scaled.info, "encoder_about": {"clock": "tracker"}},
+)
 tuned = tuning.tune(
     [late],
     model=own_model.MODEL,

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxekf._support.errors import ModelError
 from jaxekf.filtering.model import Model, Parameters
-from jaxekf.recordings.types import NANOSECONDS, Times
+from jaxekf.recordings.types import NANOSECONDS, Recording, Times
 
 ClockName = Literal["imu", "tracker"]
 RECORDING = "recording"
@@ -63,6 +63,15 @@ class Clock:
     def to_imu(self, time_ns: Times) -> Times:
         """Times (N,) of the estimate on the IMU's clock, ns."""
         return self.imu_from_tracker(time_ns) if self.name == "tracker" else time_ns
+
+    def to_encoder(self, time_ns: Times, recording: Recording) -> Times:
+        """Times (N,) of the estimate on the clock of the recording's encoder, ns.
+
+        That is the IMU's, or the tracker's for ``clock = "tracker"`` in the encoder's section.
+        """
+        if recording.info.get("encoder_about", {}).get("clock", "imu") == "imu":
+            return self.to_imu(time_ns)
+        return self.tracker_from_imu(time_ns) if self.name == "imu" else time_ns
 
     def starting_with(self, imu_ns: int) -> "Clock":
         """The same clock for an estimate that starts at a time of the IMU's clock."""

@@ -192,7 +192,8 @@ def mean_nees(error: Floats, cov: Floats) -> float:
 def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats]:
     """Errors (N, 3) of the outputs attitude, rate, position and velocity against the encoder.
 
-    The encoder is compared on the IMU's clock, its stamps less its `latency`. Attitude errors are rotation
+    The encoder is compared on its own clock (the IMU's, unless its section states the tracker's), its
+    stamps less its `latency`. Attitude errors are rotation
     vectors in the body frame, all in SI units. Instants whose nearest encoder
     sample is not scored or not known are NaN.
 
@@ -202,7 +203,7 @@ def scored_errors(estimate: Estimated, recording: Recording) -> dict[str, Floats
         If the run has no encoder.
     """
     encoder, outputs = recording.need_encoder(), estimate.outputs
-    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    time_ns = estimate.clock.to_encoder(estimate.time_ns, recording)
     truth = encoder_at(encoder, time_ns)
     errors: dict[str, Floats] = {}
     if "attitude" in outputs:
@@ -223,7 +224,7 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
     Errors count at instants of the estimate whose nearest encoder sample is scored, from `burn_in_s`
     on. A quantity that the model or the encoder does not provide is NaN. Positions are those of the
     body's origin in the reference frame. The encoder's stamps, less its `latency`, are taken for those of
-    the IMU's clock.
+    the IMU's clock, or of the tracker's where its section states ``clock = "tracker"``.
 
     Parameters
     ----------
@@ -259,7 +260,7 @@ def score(estimate: Estimated, recording: Recording, burn_in_s: float = 0.0) -> 
         got = f"a value of type {type(estimate).__name__}"
         raise arrays.argument("estimate")(got, "an estimate", "the result of jaxekf.estimate")
     burn_in_s = arrays.number(burn_in_s, arrays.argument("burn_in_s"))
-    time_ns = estimate.clock.to_imu(estimate.time_ns)
+    time_ns = estimate.clock.to_encoder(estimate.time_ns, recording)
     judged = encoder_at(recording.need_encoder(), time_ns).scored
     judged = judged & (estimate.time >= burn_in_s)
     errors = scored_errors(estimate, recording)
@@ -286,7 +287,7 @@ def _with_shifts(found: Score, estimate: Estimated, recording: Recording, settle
     if "attitude" not in outputs or not settled.any():
         return found
     time_ns, q = (
-        estimate.clock.to_imu(estimate.time_ns)[settled],
+        estimate.clock.to_encoder(estimate.time_ns, recording)[settled],
         outputs["attitude"].value[settled],
     )
     shift, sigma = attitude_shift(encoder, time_ns, q)

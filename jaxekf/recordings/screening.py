@@ -138,7 +138,7 @@ def imu(
             None, None, f"no finite row among {account.rows}", "at least one", "recording again"
         )
     assert account.numbers is not None
-    notes = (*account.notes, *joined.notes)
+    notes = (*account.notes, *joined.notes, *sensor_rates.held_note(gyroscope[valid]))
     account = replace(account, numbers=account.numbers[valid], notes=notes)
     kept = np.flatnonzero(valid)
     others = (joined.accelerometer, joined.magnetometer)

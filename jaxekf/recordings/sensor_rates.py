@@ -14,6 +14,11 @@ _SHORTEST_S, _LONGEST_S = 0.1, 0.5
 _PERIODS = 3.0
 
 
+_HELD, _LARGE = 0.05, 8.0
+"""Share of rows that repeat the one before, and steps of resolution by which the values change elsewhere,
+from which on they are held."""
+
+
 class Rows(NamedTuple):
     """Rows of an IMU of which each has a gyroscope, or is of another sensor alone."""
 
@@ -55,6 +60,28 @@ def at_gyroscope(
         magnetometer, moved = _at_nearest(time_ns, magnetometer, lone, turning)
         notes.append(f"{moved} samples of the magnetometer are moved to the nearest gyroscope's")
     return Rows(accelerometer, magnetometer, alone, tuple(notes))
+
+
+def held_note(gyroscope: Floats) -> tuple[str, ...]:
+    """A note on values (N, 3) that are held between samples; none where they repeat because they change
+    by less than the resolution."""
+    change = np.abs(np.diff(gyroscope, axis=0))
+    largest = change.max(axis=1, initial=0.0)
+    moved = largest > 0.0
+    if moved.sum() < 50 or moved.all():
+        return ()
+    step = float(change[change > 0.0].min())
+    # The change into the row that is repeated, or that of an earlier one that is repeated again.
+    last = np.maximum.accumulate(np.where(moved, np.arange(len(moved)), 0))
+    fast = largest[last] > _LARGE * step
+    share = float((~moved & fast).sum() / max(int(fast.sum()), 1))
+    if share < _HELD:
+        return ()
+    return (
+        f"{100.0 * share:.0f} % of the rows repeat the gyroscope of the row before to the last bit while"
+        " it changes by much more than its resolution: values are held between samples, such as in a"
+        " message for each sensor's event; blank the cells of a sensor that has no new sample",
+    )
 
 
 def _hz(time_ns: Times) -> str:

@@ -80,7 +80,12 @@ def load(path: Path | str) -> Recording:
         optical=optical,
         imu=imu,
         encoder=encoder,
-        info={"dataset": "BROAD", "sampling_rate_hz": hertz, "assumptions": list(_ASSUMPTIONS)},
+        info={
+            "dataset": "BROAD",
+            "sampling_rate_hz": hertz,
+            "assumptions": list(_ASSUMPTIONS),
+            "encoder_about": {"clock": "tracker"},
+        },
         path=path,
         intake={"optical": seen, "imu": felt, "encoder": true},
     )

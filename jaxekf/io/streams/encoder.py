@@ -36,6 +36,8 @@ def _read(table: Table, source: description.Source) -> tuple[Encoder, Intake]:
     its origin there, in metres. A blank position is NaN.
     """
     about, place = source.about, source.place
+    if about.get("clock", "imu") not in ("imu", "tracker"):
+        raise facts.wrong_entry(place, "encoder.clock", about["clock"], "'imu' or 'tracker'")
     scored, position = flags(table, "scored"), None
     frame = _fixed_rotation(about, "q_optical_encoder", place)
     if "angle" in table.columns:
@@ -165,6 +167,11 @@ SCHEMA = StreamSchema(
         "latency_ns": latency(),
     },
     options={
+        "clock": Option(
+            '"imu" or "tracker"',
+            'clock of the stamps, for scores of estimates whose clock offset is not 0 (default "imu")',
+            held=False,
+        ),
         "axis": Option("[x, y, z]", "axis of the joint, for the column `angle`", held=False),
         "acts_on": Option(
             '"reference" or "body"',

@@ -149,7 +149,8 @@ def occlusion(estimate: Estimate, recording: Recording) -> Figure:
             axes.set_xlim(*window)
         if known is not None:
             hold_error = _error_deg(
-                encoder_at(recording.need_encoder(), estimate.clock.to_imu(dense)), held
+                encoder_at(recording.need_encoder(), estimate.clock.to_encoder(dense, recording)),
+                held,
             )
             error = _error_deg(known, estimate.attitude.value)[near]
             sigma = np.rad2deg(estimate.attitude.sigma[near])

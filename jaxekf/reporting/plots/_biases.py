@@ -75,7 +75,9 @@ def encoder_bias(estimate: Estimated, recording: Recording) -> EncoderBias | Non
     taken = estimate.clock.from_imu(imu.time_ns)
     inside = (taken >= estimate.time_ns[0]) & (taken <= estimate.time_ns[-1])
     t = seconds(taken[inside], estimate)
-    true_rate = encoder_rate_at(recording.encoder, imu.time_ns[inside])
+    true_rate = encoder_rate_at(
+        recording.encoder, estimate.clock.to_encoder(taken[inside], recording)
+    )
     difference = np.rad2deg(imu.gyroscope[inside] - true_rate)
     return EncoderBias(t, difference, _rest_value(t, np.rad2deg(true_rate), difference))
 

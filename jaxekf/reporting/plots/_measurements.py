@@ -64,7 +64,7 @@ def truth(recording: Recording | None, estimate: Estimated, time_ns: Times) -> E
     """The encoder at some times of the estimate's clock; None without a recording or an encoder."""
     if recording is None or recording.encoder is None:
         return None
-    return encoder_at(recording.encoder, estimate.clock.to_imu(time_ns))
+    return encoder_at(recording.encoder, estimate.clock.to_encoder(time_ns, recording))
 
 
 def pose_measurements(estimate: Estimated, recording: Recording) -> PoseMeasurements:

@@ -66,15 +66,16 @@ def rate_vector(
     """Angular rate in deg/s, body frame, with the gyroscope."""
     encoder, imu = (None, None) if recording is None else (recording.encoder, recording.imu)
     known = measured = None
-    if encoder is not None:
-        at = estimate.clock.to_imu(estimate.time_ns)
+    if recording is not None and encoder is not None:
+        at = estimate.clock.to_encoder(estimate.time_ns, recording)
         known = np.rad2deg(encoder_rate_at(encoder, at))
     if imu is not None:
         times = estimate.clock.from_imu(imu.time_ns)
         inside = (times >= estimate.time_ns[0]) & (times <= estimate.time_ns[-1])
         times, gyroscope, off = times[inside], np.rad2deg(imu.gyroscope[inside]), None
-        if encoder is not None:
-            off = gyroscope - np.rad2deg(encoder_rate_at(encoder, imu.time_ns[inside]))
+        if recording is not None and encoder is not None:
+            at = estimate.clock.to_encoder(times, recording)
+            off = gyroscope - np.rad2deg(encoder_rate_at(encoder, at))
         measured = Measured(seconds(times, estimate), gyroscope, off, "gyroscope", dots=False)
     output = estimate.outputs["rate"]
     return _vector("deg/s", np.rad2deg(output.value), np.rad2deg(output.sigma), known, measured)
@@ -103,7 +104,8 @@ def velocity_vector(
     """Velocity of the body's origin in mm/s, which no sensor measures."""
     encoder, known = None if recording is None else recording.encoder, None
     if encoder is not None and encoder.position is not None:
-        at = estimate.clock.to_imu(estimate.time_ns)
+        assert recording is not None
+        at = estimate.clock.to_encoder(estimate.time_ns, recording)
         known = 1e3 * encoder_velocity_at(encoder, at)
     output = estimate.outputs["velocity"]
     return _vector("mm/s", 1e3 * output.value, 1e3 * output.sigma, known, None)

@@ -142,8 +142,12 @@ def test_truth_that_flips_or_freezes_is_not_scored(tmp_path):
     bad = with_stream(run, "encoder", q_ref_body=q)
     stored = jaxekf.load(run_folder.save(bad, tmp_path / "run.h5"))
     np.testing.assert_array_equal(stored.encoder.scored, read.encoder.scored)
-    good = jaxekf.load(run_folder.save(run, tmp_path / "good"))
-    assert good.encoder.scored.all()
+    # A body at rest at first, and turning at one rate then: its encoder repeats, too.
+    spun, _ = pair(6, duration_s=40.0, amplitude_deg=(0.0, 0.0, 0.0), bursts=[(10.0, 90.0)])
+    for number, good in enumerate((run, spun)):
+        assert jaxekf.load(run_folder.save(good, tmp_path / f"{number}")).encoder.scored.all()
+    for path in jaxekf.demo.paths(jaxekf.demo.TRAINING):
+        assert jaxekf.load(path).encoder.scored.all()
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -31,7 +31,8 @@ _EXPLAINED, _CLEAR = 0.6, 0.9
 _FEWEST = 40
 _REPEATS = 5
 _AROUND_S = 0.25
-_FROZEN_TURN = np.deg2rad(2.0)
+_FROZEN_TURN, _LARGEST_BIAS = np.deg2rad(2.0), np.deg2rad(3.0)
+"""Turn, rad, and rate, rad/s, of a gyroscope at rest that repeats of an encoder may have."""
 
 
 class Flips(NamedTuple):
@@ -278,7 +279,7 @@ def frozen(time_ns: Times, q: Floats, imu: Imu) -> Flags:
     again = np.r_[False, (q[1:] == q[:-1]).all(axis=1)]
     edges = np.flatnonzero(np.diff(np.r_[False, again, False].astype(int)))
     found = np.zeros(len(q), bool)
-    integral = Integral(imu.time_ns, imu.gyroscope - np.median(imu.gyroscope, axis=0))
+    integral = Integral(imu.time_ns, imu.gyroscope)
     last = integral.t[-1]
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         if end - begin < _REPEATS:
@@ -286,5 +287,5 @@ def frozen(time_ns: Times, q: Floats, imu: Imu) -> Flags:
         t = np.clip((time_ns[[begin, end - 1]] - imu.time_ns[0]) / NANOSECONDS, 0.0, last)
         ends = np.linspace(t[0], t[1], 20)
         path = np.linalg.norm(integral.between(ends[:-1], ends[1:]), axis=1).sum()
-        found[begin:end] = path > _FROZEN_TURN
+        found[begin:end] = path > _FROZEN_TURN + _LARGEST_BIAS * (t[1] - t[0])
     return found

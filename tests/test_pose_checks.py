@@ -70,6 +70,28 @@ def test_flips_are_a_warning_of_check():
     assert "by the same 180 deg" in text and "swapped markers" in text
 
 
+@pytest.mark.parametrize(
+    ("stretches", "count"), [([(5.0, 14.0)], 1), ([(0.0, 3.0)], 1), ([(8.0, 1.0), (28.0, 3.0)], 2)]
+)
+def test_long_flips_and_flips_at_the_ends(stretches, count):
+    """Would catch flips of nearly half of a run that hide the frame between tracker and IMU, or blame the
+    gyroscope's axes, and flips at the ends of a run passed over."""
+    bad, truth = with_flips(pair(2)[0], stretches=stretches, share=0.0)
+    assert found(rotation_findings, bad) == ((), ())
+    (text,) = found(pose_findings, bad).warnings
+    number = int(re.search(r"contradicts (\d+) of", text)[1])
+    assert abs(number - truth.sum()) < 3 and f"in {count} stretch" in text and "same 180" in text
+
+
+def test_every_other_pose_wrong_leaves_the_cause_open():
+    """Would catch the blame on another body's IMU where it is the poses that jump."""
+    run, _ = pair(3)
+    q, turn = run.optical.q_ref_body, Rotation.from_rotvec([0.0, 0.0, np.pi])
+    q = np.where(np.arange(len(q))[:, None] % 2 == 0, q, wxyz(to_scipy(q) * turn))
+    (text,) = found(rotation_findings, with_stream(run, "optical", q_ref_body=q)).warnings
+    assert text.startswith("100 % of the tracker's turns") and "swapped markers" in text
+
+
 def test_outliers_are_not_called_swapped_markers():
     """Would catch the wrong cause for poses that are wrong by another rotation each."""
     run, _ = pair(2)
@@ -120,8 +142,12 @@ def test_truth_that_flips_or_freezes_is_not_scored(tmp_path):
     bad = with_stream(run, "encoder", q_ref_body=q)
     stored = jaxekf.load(run_folder.save(bad, tmp_path / "run.h5"))
     np.testing.assert_array_equal(stored.encoder.scored, read.encoder.scored)
-    good = jaxekf.load(run_folder.save(run, tmp_path / "good"))
-    assert good.encoder.scored.all()
+    # A body at rest at first, and turning at one rate then: its encoder repeats, too.
+    spun, _ = pair(6, duration_s=40.0, amplitude_deg=(0.0, 0.0, 0.0), bursts=[(10.0, 90.0)])
+    for number, good in enumerate((run, spun)):
+        assert jaxekf.load(run_folder.save(good, tmp_path / f"{number}")).encoder.scored.all()
+    for path in jaxekf.demo.paths(jaxekf.demo.TRAINING):
+        assert jaxekf.load(path).encoder.scored.all()
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -21,6 +21,7 @@ _MOVING = np.deg2rad(5.0)
 _UNLIKE, _ALIKE, _EXPLAINED, _MIRRORED, _NOTHING = 0.6, 0.8, 0.7, 0.95, 0.4
 _JUMP = 0.3
 """Rotation between two poses, rad, that four times the usual ones must add to, to be left out as wrong."""
+_OFTEN = 0.1
 _FROZEN_S = 0.5
 """Shortest stretch of identical samples that is a frozen sensor."""
 
@@ -45,6 +46,14 @@ def rotation_findings(recording: Recording, found: Evidence) -> Findings:
     if frozen is not None or tracker is None:
         return Findings(() if frozen is None else (frozen,))
     tracker = without_flips(recording, found) or tracker
+    if (share := _jumping(tracker, imu)) > _OFTEN:
+        return Findings(
+            (
+                f"{100.0 * share:.0f} % of the tracker's turns from pose to pose are larger than any of the"
+                " gyroscope's: wrong poses (swapped markers, outliers), wrong stamps, or the IMU of another"
+                " body",
+            )
+        )
     match = _match(tracker, imu)
     if match is None or min(match.rates) < _MOVING:
         return Findings()
@@ -73,11 +82,24 @@ def rotation_findings(recording: Recording, found: Evidence) -> Findings:
         text = (
             "the gyroscope turns when the tracker does (correlation of the rates"
             f" {match.correlation:.2f}), but not about the same axes: it explains {share} of the rotation;"
-            " its axes are scaled differently or exchanged, or the quaternions have another order"
+            " its axes are scaled differently or exchanged, the quaternions have another order, or poses"
+            " are flipped for a part of the run"
         )
     else:
         return Findings()
     return Findings((text,))
+
+
+def _jumping(tracker: Optical, imu: Imu) -> float:
+    """Share of the turns between consecutive poses that exceed three times the largest of the gyroscope."""
+    rows = np.flatnonzero(tracker.valid)
+    if len(rows) < 40:
+        return 0.0
+    q = tracker.q_ref_body[rows]
+    size = np.linalg.norm(rotation_vectors(q[:-1], q[1:]), axis=1)
+    fastest = float(np.linalg.norm(imu.gyroscope, axis=1).max())
+    apart = np.diff(tracker.time_ns[rows]) / NANOSECONDS
+    return float(np.mean(size > _JUMP + 3.0 * fastest * np.maximum(apart, np.median(apart))))
 
 
 def _fits_in_part(tracker: Optical, imu: Imu) -> bool:

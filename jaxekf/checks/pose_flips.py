@@ -27,11 +27,12 @@ _LONGEST_S = 1.0
 """Poses farther apart are not compared."""
 _MOST = 0.2
 """Share of pairs up to which contradictions are single events."""
-_EXPLAINED = 0.6
+_EXPLAINED, _CLEAR = 0.6, 0.9
 _FEWEST = 40
 _REPEATS = 5
 _AROUND_S = 0.25
-_FROZEN_TURN = np.deg2rad(2.0)
+_FROZEN_TURN, _LARGEST_BIAS = np.deg2rad(2.0), np.deg2rad(3.0)
+"""Turn, rad, and rate, rad/s, of a gyroscope at rest that repeats of an encoder may have."""
 
 
 class Flips(NamedTuple):
@@ -100,7 +101,8 @@ def find_flips(time_ns: Times, q: Floats, imu: Imu, lag_s: float = 0.0) -> Flips
             or _lasts(t, q, turned, part.end if part.begin == begin else part.begin, part.offset)
         ]
     steps = []
-    if found and found[-1].end == len(t) and found[-1].begin > edges[-2]:
+    # The last part may not have returned yet, which earlier ones of the same rotation show.
+    if found and found[-1].end == len(t) and found[-1].begin > edges[-2] and not _again(found):
         last = found.pop()
         steps = [(float(time_ns[covered[last.begin]]) / NANOSECONDS, last.offset.magnitude())]
     for part in found:
@@ -162,17 +164,23 @@ def _turns(t: Floats, imu: Imu, measured: Floats, size: Floats) -> Floats | None
     integral = Integral(imu.time_ns, imu.gyroscope)
     turned = integral.between(t[:-1], t[1:])
     apart = np.diff(t)
-    near = np.flatnonzero((apart < 3.0 * np.median(apart)) & (size < 2.5))
-    if len(near) < _FEWEST:
+    near = apart < 3.0 * np.median(apart)
+    count = int(np.clip(np.ceil(0.1 / np.median(apart)), 1, max(1, near.sum() // _FEWEST)))
+    # A jump by its size alone, for the frame is not known yet. Each jump to or from a fixed wrong rotation
+    # changes sides, so that one of the sides has the right frame even where half of the poses are wrong.
+    jumped = size > 1.5 * np.linalg.norm(turned, axis=1) + 2.0 * _LEAST
+    side = np.cumsum(jumped) % 2
+    fits = []
+    for chosen in (near & ~jumped, near & ~jumped & (side == 0), near & ~jumped & (side == 1)):
+        rows = np.flatnonzero(chosen)
+        if len(rows) >= _FEWEST:
+            rows = rows[: len(rows) // count * count].reshape(-1, count)
+            ones, others = (values[rows].sum(axis=1) for values in (measured, turned))
+            fits.append((motion_agreement.fit(ones, others), np.flatnonzero(chosen)))
+    if not fits:
         return None
-    count = int(np.clip(np.ceil(0.1 / np.median(apart)), 1, len(near) // _FEWEST))
-    rows = near[: len(near) // count * count].reshape(-1, count)
-    ones, others = (values[rows].sum(axis=1) for values in (measured, turned))
-    # A jump is in one group only; a median over groups is blind to it.
-    kept = np.linalg.norm(ones, axis=1) < 1.5 * np.linalg.norm(others, axis=1) + _LEAST
-    if kept.sum() < _FEWEST // 2:
-        return None
-    found = motion_agreement.fit(ones[kept], others[kept])
+    clear = [made for made in fits[:1] if made[0].explained > _CLEAR]
+    found, near = max(clear or fits, key=lambda made: made[0].explained)
     if not found.explained > _EXPLAINED:
         return None
     turned = turned @ found.frame.T
@@ -199,6 +207,12 @@ def _offsets(
             wrong = Rotation.identity()
         found.append(wrong.as_rotvec())
     return Rotation.from_rotvec(found)
+
+
+def _again(parts: list[_Part]) -> bool:
+    """Whether the last part has the wrong rotation of an earlier one."""
+    *earlier, last = parts
+    return any((one.offset.inv() * last.offset).magnitude() < 2.0 * _LEAST for one in earlier)
 
 
 def _fixed(parts: list[_Part]) -> tuple[bool, float]:
@@ -265,7 +279,7 @@ def frozen(time_ns: Times, q: Floats, imu: Imu) -> Flags:
     again = np.r_[False, (q[1:] == q[:-1]).all(axis=1)]
     edges = np.flatnonzero(np.diff(np.r_[False, again, False].astype(int)))
     found = np.zeros(len(q), bool)
-    integral = Integral(imu.time_ns, imu.gyroscope - np.median(imu.gyroscope, axis=0))
+    integral = Integral(imu.time_ns, imu.gyroscope)
     last = integral.t[-1]
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         if end - begin < _REPEATS:
@@ -273,5 +287,5 @@ def frozen(time_ns: Times, q: Floats, imu: Imu) -> Flags:
         t = np.clip((time_ns[[begin, end - 1]] - imu.time_ns[0]) / NANOSECONDS, 0.0, last)
         ends = np.linspace(t[0], t[1], 20)
         path = np.linalg.norm(integral.between(ends[:-1], ends[1:]), axis=1).sum()
-        found[begin:end] = path > _FROZEN_TURN
+        found[begin:end] = path > _FROZEN_TURN + _LARGEST_BIAS * (t[1] - t[0])
     return found

@@ -105,6 +105,17 @@ def tune(
     ------
     TuningError
         If the problem is ill-posed; bad data raise as in `estimate`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=20)
+    >>> tuned.stopped
+    'converged'
+    >>> print(f"from {tuned.start.noise.optical:.4f} to {tuned.params.noise.optical:.4f} rad")
+    from 0.0052 to 0.0053 rad
     """
     require_float64()
     learnt, validation = read(runs), read(validate)
@@ -236,6 +247,16 @@ def fit_runs(
     ------
     TuningError
         If two runs have the same name.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=2)
+    >>> fitted = tuning.fit_runs(jaxekf.demo.paths(("free-5",)), tuned)
+    >>> fitted["free-5"] == tuned.params  # no parameter that each run has for itself
+    True
     """
     recordings = read(runs)
     names = _different_names(recordings)

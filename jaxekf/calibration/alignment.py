@@ -93,6 +93,14 @@ def align_run(recording: Recording) -> RunAlignment:
     ------
     RecordingError
         If the tracker's alignment cannot be estimated. A failure of the encoder becomes a note.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.calibration import alignment
+    >>> tracker = alignment.align_run(jaxekf.load(jaxekf.demo.FOLDER / "free-5")).tracker
+    >>> abs(tracker.latency_s) < 1e-3, bool(np.linalg.norm(tracker.alignment) < 0.01)  # s, rad
+    (True, True)
     """
     imu, place = recording.need_imu(), recording.path or recording.name
     tracker = align(poses(recording), imu, place)
@@ -148,7 +156,17 @@ def has_drift(found: AttitudeMatch) -> bool:
 
 
 def combine_runs(runs: Sequence[RunAlignment]) -> CombinedAlignment:
-    """One latency and one alignment for all runs, each run weighted by its inverse covariance."""
+    """One latency and one alignment for all runs, each run weighted by its inverse covariance.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.calibration import alignment
+    >>> runs = [jaxekf.load(path) for path in jaxekf.demo.paths(("free-4", "free-5"))]
+    >>> mean = alignment.combine_runs([alignment.align_run(run) for run in runs])
+    >>> mean.runs, abs(mean.latency_s) < 1e-3, mean.sentences()
+    (2, True, ())
+    """
     found = [run.tracker for run in runs]
     latency = np.array([m.latency_s for m in found])[:, None]
     variance = np.array([[[m.latency_sigma_s**2]] for m in found])

@@ -142,7 +142,17 @@ def averaging_lengths(count: int) -> Floats:
 
 
 def overlapping_deviation(values: Floats, lengths: Floats) -> Floats:
-    """Overlapping Allan deviation (T,) of samples (n,) at averaging lengths (T,), in samples."""
+    """Overlapping Allan deviation (T,) of samples (n,) at averaging lengths (T,), in samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.calibration import allan
+    >>> white = np.random.default_rng(1).standard_normal(100_000)
+    >>> deviation = allan.overlapping_deviation(white, np.array([1, 100]))
+    >>> bool(abs(deviation[0] / deviation[1] - 10.0) < 0.5)  # falls with the root of the time
+    True
+    """
     values = arrays.floats(values, arrays.argument("values"), (None,))
     lengths = arrays.floats(lengths, arrays.argument("lengths"), (None,))
     total = np.concatenate([[0.0], np.cumsum(values - np.mean(values))])

@@ -105,6 +105,18 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
     RecordingError
         If the gyroscope does not explain the rotation of the tracker, if too few stretches remain, or if
         the clocks drift by more than 1000 ppm.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> from jaxekf.calibration import attitude_alignment, time_offset
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical, imu = run.need_optical(), run.need_imu()
+    >>> late = replace(optical, time_ns=optical.time_ns + 20_000_000)
+    >>> found = attitude_alignment.refine(late, imu, time_offset.match(late, imu))
+    >>> round(float(found.latency_s), 3), bool(found.latency_sigma_s < 1e-3)
+    (0.02, True)
     """
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     stretches = _stretches(optical, imu, start.latency_s, place)

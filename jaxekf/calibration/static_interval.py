@@ -78,6 +78,13 @@ def static_head(recording: Recording) -> float:
     ------
     RecordingError
         If the interval is shorter than 3 s, or if the tracker rotates steadily during it.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.calibration import static_interval
+    >>> round(static_interval.static_head(jaxekf.load(jaxekf.demo.FOLDER / "constant-rate")))  # s
+    6
     """
     place = str(recording.path or recording.name)
     imu = recording.need_imu()

@@ -70,6 +70,15 @@ def static_noise(
     ------
     RecordingError
         If the interval is too short or outside the run.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.calibration import static_noise
+    >>> found = static_noise.static_noise(jaxekf.load(jaxekf.demo.FOLDER / "constant-rate"))
+    >>> white = np.rad2deg(found.imu.gyroscope.white)  # deg/s/sqrt(Hz); the simulator has 0.05
+    >>> bool((np.abs(white - 0.05) < 0.02).all())
+    True
     """
     imu = recording.need_imu()
     last = float(imu.time_ns[-1] - imu.time_ns[0]) / NANOSECONDS

@@ -93,6 +93,17 @@ def match(optical: Optical, imu: Imu, place: object = "recording") -> Match:
     RecordingError
         If there are fewer than 50 relative rotations, if the motion determines the latency to no
         better than 5 ms, or if the latency is half a second or more.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import jaxekf
+    >>> from jaxekf.calibration import time_offset
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> optical = run.need_optical()
+    >>> late = replace(optical, time_ns=optical.time_ns + 20_000_000)
+    >>> round(float(time_offset.match(late, run.need_imu()).latency_s), 2)
+    0.02
     """
     turns = _relative_rotations(optical, imu)
     if len(turns.turn) < _FEWEST:

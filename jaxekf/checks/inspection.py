@@ -119,7 +119,16 @@ class Inspection:
 
 
 def inspect(recording: Recording) -> Inspection:
-    """Inspect a run; a finding is reported and never raises."""
+    """Inspect a run; a finding is reported and never raises.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.checks import inspection
+    >>> found = inspection.inspect(jaxekf.load(jaxekf.demo.FOLDER / "free-5"))
+    >>> found.verdict, found.faults
+    ('fine', ())
+    """
     streams = {label: _stream(recording, label) for label in recording.streams}
     found = evidence(recording)
     faults, warnings, notes = [], [], []
@@ -231,7 +240,15 @@ def _summary(
 
 
 def find_gaps(time_ns: Times) -> Gaps:
-    """Gaps of a stream: steps of more than 1.5 times the median."""
+    """Gaps of a stream: steps of more than 1.5 times the median.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.checks import inspection
+    >>> inspection.find_gaps(np.array([0, 10, 20, 30, 90, 100]) * 1_000_000)
+    Gaps(count=1, longest_s=0.06, lost_s=0.06, spans=[(0.03, 0.09)])
+    """
     step = np.diff(time_ns)
     if step.size == 0:
         return Gaps(0, 0.0, 0.0, [])

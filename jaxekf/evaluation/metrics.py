@@ -47,7 +47,16 @@ class Score(NamedTuple):
 
 
 def attitude_error(q: Floats, truth: Floats) -> Floats:
-    """Rotation vectors (N, 3), rad, from `q` to `truth`, in the body frame of `q`."""
+    """Rotation vectors (N, 3), rad, from `q` to `truth`, in the body frame of `q`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> identity, quarter_turn_about_z = np.eye(4)[:1], np.sqrt([[0.5, 0.0, 0.0, 0.5]])
+    >>> np.rad2deg(metrics.attitude_error(identity, quarter_turn_about_z)).round(6).tolist()
+    [[0.0, 0.0, 90.0]]
+    """
     return (to_scipy(q).inv() * to_scipy(truth)).as_rotvec()
 
 
@@ -72,6 +81,14 @@ def orientation_error(
         (N, 4) quaternions, body to reference.
     up
         Vertical in the reference frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> identity, quarter_turn_about_z = np.eye(4)[:1], np.sqrt([[0.5, 0.0, 0.0, 0.5]])
+    >>> [round(angle, 6) for angle in metrics.orientation_error(quarter_turn_about_z, identity)]
+    [90.0, 90.0, 0.0]
     """
     off = (to_scipy(q) * to_scipy(truth).inv()).as_quat()
     vertical = np.asarray(up) / np.linalg.norm(up)
@@ -85,19 +102,45 @@ def orientation_error(
 
 
 def rms(values: Floats) -> float:
-    """Root mean square of the lengths of vectors (N, d); NaN rows are ignored."""
+    """Root mean square of the lengths of vectors (N, d); NaN rows are ignored.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> metrics.rms(np.array([[3.0, 4.0, 0.0], [np.nan, 0.0, 0.0]]))
+    5.0
+    """
     squared = np.sum(np.asarray(values) ** 2, axis=-1)
     squared = squared[np.isfinite(squared)]
     return float(np.sqrt(np.mean(squared))) if squared.size else float("nan")
 
 
 def normalised_square(error: Floats, cov: Floats) -> Floats:
-    """``e' inv(P) e`` (N,) of errors (N, d) and covariances (N, d, d)."""
+    """``e' inv(P) e`` (N,) of errors (N, d) and covariances (N, d, d).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> error, cov = np.array([[2.0, 6.0]]), np.diag([4.0, 9.0])[None]
+    >>> metrics.normalised_square(error, cov).tolist()  # 1^2 + 2^2
+    [5.0]
+    """
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
 
 
 def mean_nees(error: Floats, cov: Floats) -> float:
-    """Mean of ``e' inv(P) e / d`` over errors (N, d) and covariances (N, d, d); NaN for none."""
+    """Mean of ``e' inv(P) e / d`` over errors (N, d) and covariances (N, d, d); NaN for none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.evaluation import metrics
+    >>> error, cov = np.array([[0.1, -0.1, 0.1]]), 0.01 * np.eye(3)[None]
+    >>> round(metrics.mean_nees(error, cov), 6)  # errors as large as their deviations
+    1.0
+    """
     squared = normalised_square(error, cov)
     return float(np.mean(squared) / error.shape[1]) if squared.size else float("nan")
 
@@ -195,7 +238,16 @@ def hold_last(optical: Optical, time_ns: Times) -> Floats:
 
 
 def score_hold_last(recording: Recording, time_ns: Times) -> float:
-    """Attitude RMSE, degrees, of the baseline `hold_last` on the encoder's scored samples."""
+    """Attitude RMSE, degrees, of the baseline `hold_last` on the encoder's scored samples.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.evaluation import metrics
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> round(metrics.score_hold_last(run, run.need_imu().time_ns), 1)  # deg, mostly of occlusions
+    12.4
+    """
     truth = encoder_at(recording.need_encoder(), time_ns)
     held = hold_last(recording.need_optical(), time_ns)
     error = attitude_error(held[truth.scored], truth.q_ref_body[truth.scored])

@@ -27,6 +27,15 @@ def nearest_rotation(matrix: Floats) -> Floats:
     Returns
     -------
     Rotation matrices (..., 3, 3).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import host_rotation
+    >>> quarter_turn_about_z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    >>> stretched = quarter_turn_about_z * [1.1, 0.9, 1.0]
+    >>> np.allclose(host_rotation.nearest_rotation(stretched), quarter_turn_about_z)
+    True
     """
     u, _, vt = np.linalg.svd(matrix)
     u[..., 2] *= np.linalg.det(u @ vt)[..., None]
@@ -34,7 +43,15 @@ def nearest_rotation(matrix: Floats) -> Floats:
 
 
 def skew(vectors: Floats) -> Floats:
-    """Matrices (..., 3, 3) of the cross product with vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
+    """Matrices (..., 3, 3) of the cross product with vectors (..., 3): ``skew(a) @ b == cross(a, b)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import host_rotation
+    >>> host_rotation.skew(np.array([1, 2, 3])).tolist()
+    [[0, -3, 2], [3, 0, -1], [-2, 1, 0]]
+    """
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
@@ -55,6 +72,15 @@ def running_product(q: Floats) -> Floats:
     Returns
     -------
     (N + 1, 4) unit quaternions but for rounding; the first is the identity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import host_rotation
+    >>> quarter_turns_about_z = np.tile(np.sqrt([0.5, 0.0, 0.0, 0.5]), (4, 1))
+    >>> w, _, _, z = host_rotation.running_product(quarter_turns_about_z).T
+    >>> np.rad2deg(2.0 * np.arctan2(z, w)).round().tolist()
+    [0.0, 90.0, 180.0, 270.0, 360.0]
     """
     count = len(q)
     width = max(1, int(np.sqrt(count)))

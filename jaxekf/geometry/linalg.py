@@ -17,32 +17,91 @@ from jaxekf._support.errors import ArgumentError
 
 
 def symmetrise(matrix: Array) -> Array:
-    """The symmetric part, (n, n, ...)."""
+    """The symmetric part, (n, n, ...).
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> from jaxekf.geometry import linalg
+    >>> linalg.symmetrise(jnp.array([[1.0, 2.0], [4.0, 3.0]])).tolist()
+    [[1.0, 3.0], [3.0, 3.0]]
+    """
     return 0.5 * (matrix + matrix.swapaxes(0, 1))
 
 
 def diagonal(matrix: Array) -> Array:
-    """Diagonal, shape (n, n, ...) to (n, ...)."""
+    """Diagonal, shape (n, n, ...) to (n, ...).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> linalg.diagonal(np.array([[1.0, 2.0], [4.0, 3.0]])).tolist()
+    [1.0, 3.0]
+    >>> linalg.diagonal(np.zeros((2, 2, 16))).shape  # 16 runs on the last axis
+    (2, 16)
+    """
     return jnp.stack([matrix[i, i] for i in range(matrix.shape[0])])
 
 
 def multiply(left: Array, right: Array) -> Array:
-    """Matrix product, shapes (i, k, ...), (k, j, ...) to (i, j, ...)."""
+    """Matrix product, shapes (i, k, ...), (k, j, ...) to (i, j, ...).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> swap = np.array([[0.0, 1.0], [1.0, 0.0]])
+    >>> linalg.multiply(swap, np.array([[1.0, 2.0], [3.0, 4.0]])).tolist()
+    [[3.0, 4.0], [1.0, 2.0]]
+    >>> linalg.multiply(np.zeros((2, 3, 16)), np.zeros((3, 4, 16))).shape  # 16 runs
+    (2, 4, 16)
+    """
     return jnp.sum(left[:, :, None] * right[None], axis=1)
 
 
 def multiply_transposed(left: Array, right: Array) -> Array:
-    """``left @ right.T``, shapes (i, k, ...), (j, k, ...) to (i, j, ...)."""
+    """``left @ right.T``, shapes (i, k, ...), (j, k, ...) to (i, j, ...).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> left, right = np.arange(6.0).reshape(2, 3), np.ones((4, 3))
+    >>> np.allclose(linalg.multiply_transposed(left, right), left @ right.T)
+    True
+    """
     return jnp.sum(left[:, None] * right[None], axis=2)
 
 
 def congruence(left: Array, matrix: Array) -> Array:
-    """``left @ matrix @ left.T`` of a symmetric matrix, (i, k, ...), (k, k, ...) to (i, i, ...)."""
+    """``left @ matrix @ left.T`` of a symmetric matrix, (i, k, ...), (k, k, ...) to (i, i, ...).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> transition = np.array([[1.0, 0.5], [0.0, 1.0]])  # of position and velocity over 0.5 s
+    >>> cov = np.diag([0.0, 4.0])
+    >>> linalg.congruence(transition, cov).tolist()
+    [[1.0, 2.0], [2.0, 4.0]]
+    """
     return symmetrise(multiply_transposed(multiply(left, matrix), left))
 
 
 def identity_like(matrix: Array) -> Array:
-    """Identity matrix broadcast to the shape (n, n, ...) of `matrix`."""
+    """Identity matrix broadcast to the shape (n, n, ...) of `matrix`.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> jaxekf.set_up()
+    >>> linalg.identity_like(np.zeros((2, 2))).tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    >>> linalg.identity_like(np.zeros((2, 2, 16))).shape
+    (2, 2, 16)
+    """
     size = matrix.shape[0]
     eye = jnp.eye(size, dtype=matrix.dtype).reshape((size, size) + (1,) * (matrix.ndim - 2))
     return jnp.broadcast_to(eye, matrix.shape)
@@ -67,6 +126,13 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
     ------
     ArgumentError
         For any other shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> linalg.standard_deviation_factor(np.array([0.5, 2.0]), 2).tolist()
+    [[0.5, 0.0], [0.0, 2.0]]
     """
     deviation = jnp.asarray(deviation)
     if deviation.ndim == 0:
@@ -82,13 +148,31 @@ def standard_deviation_factor(deviation: Array, dim: int) -> Array:
 
 
 def covariance(deviation: Array, dim: int) -> Array:
-    """Covariance (dim, dim) of a noise parameter; see `standard_deviation_factor`."""
+    """Covariance (dim, dim) of a noise parameter; see `standard_deviation_factor`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> linalg.covariance(3.0, 2).tolist()  # one deviation for both axes
+    [[9.0, 0.0], [0.0, 9.0]]
+    >>> linalg.covariance(np.array([[2.0, 0.0], [1.0, 1.0]]), 2).tolist()  # a triangular factor
+    [[4.0, 2.0], [2.0, 2.0]]
+    """
     factor = standard_deviation_factor(deviation, dim)
     return factor @ factor.T
 
 
 def block_diagonal(blocks: Sequence[Array]) -> Array:
-    """The block-diagonal matrix (n, n) of square matrices, in order."""
+    """The block-diagonal matrix (n, n) of square matrices, in order.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> linalg.block_diagonal([np.ones((1, 1)), 2.0 * np.eye(2)]).tolist()
+    [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]
+    """
     return jnp.block(
         [
             [row if i == j else jnp.zeros((len(row), len(b))) for j, b in enumerate(blocks)]
@@ -98,13 +182,31 @@ def block_diagonal(blocks: Sequence[Array]) -> Array:
 
 
 def block_covariance(deviations: Sequence[Any], dims: Sequence[int] | None = None) -> Array:
-    """Block-diagonal covariance of independent noise parameters, of three axes each or of `dims`."""
+    """Block-diagonal covariance of independent noise parameters, of three axes each or of `dims`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> gyroscope, walk = 2.0, np.array([1.0, 1.0, 3.0])
+    >>> np.diagonal(linalg.block_covariance([gyroscope, walk])).tolist()
+    [4.0, 4.0, 4.0, 1.0, 1.0, 9.0]
+    """
     dims = dims or (3,) * len(deviations)
     return block_diagonal([covariance(d, dim) for d, dim in zip(deviations, dims, strict=True)])
 
 
 def adjugate(matrix: Array) -> tuple[Array, Array]:
-    """Adjugate (3, 3) and determinant () of a matrix (3, 3): the inverse is their ratio."""
+    """Adjugate (3, 3) and determinant () of a matrix (3, 3): the inverse is their ratio.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> adjugate, determinant = linalg.adjugate(np.diag([1.0, 2.0, 4.0]))
+    >>> np.diagonal(adjugate).tolist(), float(determinant)
+    ([8.0, 4.0, 2.0], 8.0)
+    """
     a, b, c = matrix
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     return rows, jnp.sum(a * rows[:, 0])
@@ -115,6 +217,15 @@ def mask_covariance(matrix: Array, mask: Array) -> Array:
 
     The visible sub-block is unchanged, so a factor of the result whitens the visible rows as if the masked
     ones did not exist, correlations included.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> jaxekf.set_up()
+    >>> cov, visible = np.array([[4.0, 1.0], [1.0, 9.0]]), np.array([True, False])
+    >>> linalg.mask_covariance(cov, visible).tolist()
+    [[4.0, 0.0], [0.0, 1.0]]
     """
     both = mask[:, None] & mask[None, :]
     return jnp.where(both, matrix, identity_like(matrix))
@@ -124,6 +235,14 @@ def whitener(matrix: Array) -> tuple[Array, Array]:
     """Lower Cholesky factor of a small positive definite matrix, and the reciprocals of its diagonal.
 
     Shapes (m, m, ...) to (m, m, ...) and (m, ...). The result is NaN if the matrix is not definite.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> factor, reciprocals = jax.jit(linalg.whitener)(np.array([[4.0, 2.0], [2.0, 5.0]]))
+    >>> np.allclose(factor, [[2.0, 0.0], [1.0, 2.0]]), np.allclose(reciprocals, 0.5)
+    (True, True)
     """
     size = matrix.shape[0]
     rows: list[list[Array]] = []
@@ -150,6 +269,14 @@ def semidefinite_factor(matrix: Array) -> Array:
 
     A variance that is zero up to rounding gives a zero column with zero derivative. The result is NaN
     if the matrix is not semidefinite.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> factor = jax.jit(linalg.semidefinite_factor)(np.array([[4.0, 0.0], [0.0, 0.0]]))
+    >>> np.allclose(factor, [[2.0, 0.0], [0.0, 0.0]])  # a variance of zero is no failure
+    True
     """
     size = matrix.shape[0]
     index = jnp.arange(size).reshape((size,) + (1,) * (matrix.ndim - 2))
@@ -175,7 +302,16 @@ def semidefinite_factor(matrix: Array) -> Array:
 
 
 def whiten(white: tuple[Array, Array], right: Array) -> Array:
-    """``inv(factor) @ right`` with the result of `whitener`, right (m, ...) or (m, n, ...)."""
+    """``inv(factor) @ right`` with the result of `whitener`, right (m, ...) or (m, n, ...).
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> white = jax.jit(linalg.whitener)(np.array([[4.0, 0.0], [0.0, 9.0]]))  # deviations 2 and 3
+    >>> np.asarray(linalg.whiten(white, np.array([2.0, 6.0]))).round(5).tolist()
+    [1.0, 2.0]
+    """
     factor, inverses = white
     if right.ndim == factor.ndim:
         factor, inverses = factor[:, :, None], inverses[:, None]
@@ -189,7 +325,16 @@ def whiten(white: tuple[Array, Array], right: Array) -> Array:
 
 
 def squared_distance(residual: Array, cov: Array) -> Array:
-    """Squared Mahalanobis distance ``r' inv(S) r``, shapes (m, ...), (m, m, ...) to (...)."""
+    """Squared Mahalanobis distance ``r' inv(S) r``, shapes (m, ...), (m, m, ...) to (...).
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import linalg
+    >>> innovation, cov = np.array([2.0, 6.0]), np.diag([4.0, 9.0])
+    >>> round(float(jax.jit(linalg.squared_distance)(innovation, cov)), 4)  # 1^2 + 2^2
+    5.0
+    """
     white = whiten(whitener(cov), residual)
     total = white[0] * white[0]
     for w in white[1:]:

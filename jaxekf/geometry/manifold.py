@@ -127,19 +127,10 @@ class Euclidean(_Additive):
 
     Examples
     --------
-    A state of attitude and two magnetometer offsets, and the rows of its covariance:
-
-    >>> from typing import Any, NamedTuple
     >>> import jaxekf
-    >>> from jaxekf.geometry import manifold
-    >>> class State(NamedTuple):
-    ...     q_ref_body: Any
-    ...     offset: Any
-    >>> space = State(jaxekf.SO3(), jaxekf.Euclidean(2, "uT", labels=("x", "y")))
-    >>> manifold.error_labels(space)
-    ('q_ref_body_x', 'q_ref_body_y', 'q_ref_body_z', 'offset_x', 'offset_y')
-    >>> manifold.error_units(space)
-    ('rad', 'rad', 'rad', 'uT', 'uT')
+    >>> offset = jaxekf.Euclidean(2, "uT", labels=("east", "north"))
+    >>> offset.dim, offset.error_labels, offset.unit
+    (2, ('east', 'north'), 'uT')
     """
 
     size: int
@@ -277,7 +268,15 @@ def _flatten(space: Any, *states: Any) -> tuple[list[Manifold], list[list[Array]
 
 
 def parts(space: Any) -> tuple[Part, ...]:
-    """The leaves of a space in order, with their names and slices of the error vector."""
+    """The leaves of a space in order, with their names and slices of the error vector.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> [(part.name, part.manifold.dim) for part in manifold.parts(jaxekf.get_model("loose").space)]
+    [('q_ref_body', 3), ('bias', 3)]
+    """
     found, start = [], 0
     for path, manifold in jax.tree_util.tree_flatten_with_path(space, is_leaf=_is_manifold)[0]:
         name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
@@ -287,12 +286,28 @@ def parts(space: Any) -> tuple[Part, ...]:
 
 
 def error_dim(space: Any) -> int:
-    """Length of the error vector of a space."""
+    """Length of the error vector of a space.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.error_dim(jaxekf.SO3())  # of four stored numbers
+    3
+    """
     return sum(part.manifold.dim for part in parts(space))
 
 
 def error_labels(space: Any) -> tuple[str, ...]:
-    """Name of each component of the error vector, ``bias_x`` for instance."""
+    """Name of each component of the error vector, ``bias_x`` for instance.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.error_labels(jaxekf.get_model("loose").space)[-3:]
+    ('bias_x', 'bias_y', 'bias_z')
+    """
     return tuple(
         "_".join(filter(None, (part.name, label)))
         for part in parts(space)
@@ -315,7 +330,18 @@ def error_units(space: Any) -> tuple[str, ...]:
 
 
 def retract(space: Any, x: Any, delta: Array) -> Any:
-    """``x`` moved by the error vector ``delta``, shape (error_dim,)."""
+    """``x`` moved by the error vector ``delta``, shape (error_dim,).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> delta = np.array([0.0, 0.0, np.pi / 2])  # a quarter turn about z
+    >>> moved = manifold.retract(jaxekf.SO3(), rotation.identity(), delta)
+    >>> np.allclose(moved, np.sqrt([0.5, 0.0, 0.0, 0.5]))
+    True
+    """
     manifolds, (leaves,), structure = _flatten(space, x)
     moved, start = [], 0
     for manifold, leaf in zip(manifolds, leaves, strict=True):
@@ -325,7 +351,18 @@ def retract(space: Any, x: Any, delta: Array) -> Any:
 
 
 def local(space: Any, x: Any, y: Any) -> Array:
-    """The error vector that moves ``x`` to ``y``, shape (error_dim,)."""
+    """The error vector that moves ``x`` to ``y``, shape (error_dim,).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> half_turn_about_y = np.array([0.0, 0.0, 1.0, 0.0])
+    >>> delta = manifold.local(jaxekf.SO3(), rotation.identity(), half_turn_about_y)
+    >>> np.rad2deg(delta).round(9).tolist()
+    [0.0, 180.0, 0.0]
+    """
     manifolds, (first, second), _ = _flatten(space, x, y)
     return jnp.concatenate(
         [m.local(a, b) for m, a, b in zip(manifolds, first, second, strict=True)]
@@ -333,7 +370,15 @@ def local(space: Any, x: Any, y: Any) -> Array:
 
 
 def lift(space: Any, x: Any, delta: Array) -> Any:
-    """An error vector as a change of the stored numbers of ``x`` (linear in `delta`)."""
+    """An error vector as a change of the stored numbers of ``x`` (linear in `delta`).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> manifold.lift(jaxekf.SO3(), rotation.identity(), np.array([0.0, 0.0, 0.5])).tolist()
+    [0.0, 0.0, 0.0, 0.25]
+    """
     manifolds, (leaves,), structure = _flatten(space, x)
     changes, start = [], 0
     for manifold, leaf in zip(manifolds, leaves, strict=True):
@@ -351,7 +396,15 @@ def lower(space: Any, x: Any, change: Any) -> Array:
 
 
 def is_curved(space: Any) -> bool:
-    """Whether a change of the mean changes the covariance, because a part of the space is curved."""
+    """Whether a change of the mean changes the covariance, because a part of the space is curved.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.geometry import manifold
+    >>> manifold.is_curved(jaxekf.SO3()), manifold.is_curved(jaxekf.Euclidean(3))
+    (True, False)
+    """
     return any(part.manifold.curved for part in parts(space))
 
 
@@ -360,6 +413,16 @@ def reset_jacobian(space: Any, delta: Array) -> Array:
 
     To first order the error about the updated mean is ``J(delta)`` times the error about the old one (Sola,
     Deray, Atchuthan 2018, eq. 67 for rotations).
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import manifold, rotation
+    >>> jaxekf.set_up()
+    >>> delta = np.array([0.0, 0.0, 0.1])
+    >>> jacobian = jax.jit(lambda delta: manifold.reset_jacobian(jaxekf.SO3(), delta))(delta)
+    >>> np.allclose(jacobian, np.eye(3) - rotation.skew(delta) / 2.0, atol=2e-3)  # the first terms
+    True
     """
     size = error_dim(space)
     rows = []

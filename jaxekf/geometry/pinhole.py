@@ -13,7 +13,17 @@ _ITERATIONS = 8
 
 
 class Lens(NamedTuple):
-    """Intrinsic parameters of a camera."""
+    """Intrinsic parameters of a camera.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry.pinhole import Lens, project
+    >>> lens = Lens(focal=np.full(2, 500.0), centre=np.array([320.0, 240.0]), radial=np.zeros(2))
+    >>> pixel = jax.jit(project)(lens, np.array([0.2, 0.1, 1.0]))
+    >>> np.asarray(pixel).round(2).tolist()
+    [420.0, 290.0]
+    """
 
     focal: Any
     """(2,) pixels."""
@@ -24,7 +34,16 @@ class Lens(NamedTuple):
 
 
 def stretch(radial: Any, point: Any) -> Any:
-    """Radial distortion factor (...) of points (..., 2) in focal lengths, in JAX or NumPy."""
+    """Radial distortion factor (...) of points (..., 2) in focal lengths, in JAX or NumPy.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import pinhole
+    >>> barrel = np.array([-0.1, 0.0])
+    >>> float(pinhole.stretch(barrel, np.array([0.5, 0.0])))  # 1 - 0.1 0.5^2
+    0.975
+    """
     r2 = (point * point).sum(axis=-1)
     return 1.0 + (radial[0] + radial[1] * r2) * r2
 
@@ -45,6 +64,18 @@ def project(lens: Lens, p_camera: Array) -> Array:
     Returns
     -------
     (2,) pixels.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import pinhole
+    >>> lens = pinhole.Lens(np.full(2, 500.0), np.array([320.0, 240.0]), np.zeros(2))
+    >>> pixel = jax.jit(pinhole.project)(lens, np.array([0.4, 0.0, 2.0]))
+    >>> np.asarray(pixel).round(2).tolist()  # 320 + 500 * 0.4 / 2
+    [420.0, 240.0]
+    >>> behind = jax.jit(pinhole.project)(lens, np.array([0.4, 0.0, -2.0]))
+    >>> np.asarray(behind).round(2).tolist()
+    [5320.0, 5240.0]
     """
     in_front = p_camera[2] > NEAREST
     visible = jnp.where(in_front, p_camera, jnp.array([0.0, 0.0, 1.0]))
@@ -58,6 +89,15 @@ def ray(lens: Lens, pixel: Array) -> Array:
 
     The inverse of `project` by a fixed-point iteration, which converges for distortions that keep the order
     of image points.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import pinhole
+    >>> lens = pinhole.Lens(np.full(2, 500.0), np.array([320.0, 240.0]), np.array([-0.1, 0.0]))
+    >>> pixel = jax.jit(pinhole.project)(lens, np.array([0.4, -0.2, 2.0]))
+    >>> np.allclose(jax.jit(pinhole.ray)(lens, pixel), [0.2, -0.1], atol=1e-5)
+    True
     """
     bent = (pixel - lens.centre) / lens.focal
     point = bent

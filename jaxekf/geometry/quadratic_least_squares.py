@@ -24,7 +24,16 @@ def _times(matrix: Array, vector: Array) -> Array:
 
 
 class Quadratic(NamedTuple):
-    """Residuals ``constant + linear @ x + x' curved x``, in units of their noise."""
+    """Residuals ``constant + linear @ x + x' curved x``, in units of their noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry.quadratic_least_squares import Quadratic
+    >>> problem = Quadratic(-np.ones(3), np.diag([1.0, 2.0, 4.0]), np.zeros((3, 3, 3)))
+    >>> problem.residual(np.ones(3)).tolist()
+    [0.0, 1.0, 3.0]
+    """
 
     constant: Array
     """(n,)."""
@@ -47,7 +56,18 @@ class Quadratic(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """QR factors ``matrix = basis @ inv(inverse)`` of a matrix (n, 3), by modified Gram-Schmidt."""
+    """QR factors ``matrix = basis @ inv(inverse)`` of a matrix (n, 3), by modified Gram-Schmidt.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import quadratic_least_squares
+    >>> jaxekf.set_up()
+    >>> flat = np.diag([1.0, 2.0, 0.0])  # nothing depends on the third number
+    >>> factors = jax.jit(quadratic_least_squares.orthogonalise)(flat, np.ones(3))
+    >>> bool(factors.weak), np.diagonal(factors.inverse).round(5).tolist()
+    (True, [1.0, 0.5, 0.0])
+    """
 
     basis: Array
     """Orthonormal columns (n, 3); zero for a column that depends on the previous ones."""
@@ -73,7 +93,17 @@ def _upper_inverse(r01: Array, r02: Array, r12: Array, diagonal: list[Array]) ->
 
 
 def orthogonalise(matrix: Array, right: Array) -> Factors:
-    """Factors of `matrix` (n, 3) and the right-hand side (n,); finite for any matrix."""
+    """Factors of `matrix` (n, 3) and the right-hand side (n,); finite for any matrix.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import quadratic_least_squares
+    >>> matrix, right = np.diag([1.0, 2.0, 4.0]), np.array([1.0, 2.0, 8.0])
+    >>> factors = jax.jit(quadratic_least_squares.orthogonalise)(matrix, right)
+    >>> (factors.inverse @ factors.right).round(5).tolist()  # the solution of matrix @ x = right
+    [1.0, 1.0, 2.0]
+    """
     total = jnp.sum(lax.stop_gradient(matrix) ** 2)
     scale = jnp.sqrt(jnp.where(total > 0.0, total, 1.0))
     columns = [matrix[:, 0], matrix[:, 1], matrix[:, 2], right]
@@ -132,12 +162,31 @@ def _damped_step(problem: Quadratic, x: Array, damping: Array) -> Array:
 
 
 def tolerance(x: Array) -> float:
-    """Relative step length at which the search has converged; a further step would be rounding."""
+    """Relative step length at which the search has converged; a further step would be rounding.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import quadratic_least_squares
+    >>> f"{quadratic_least_squares.tolerance(np.zeros(3)):.1e}"
+    '1.5e-08'
+    """
     return float(jnp.finfo(x.dtype).eps) ** 0.5
 
 
 def descend(problem: Quadratic, start: Array) -> tuple[Array, Array]:
-    """Damped steps from `start` (3,), and whether they converged; without derivatives."""
+    """Damped steps from `start` (3,), and whether they converged; without derivatives.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry.quadratic_least_squares import Quadratic, descend
+    >>> jaxekf.set_up()
+    >>> problem = Quadratic(-np.ones(3), np.diag([1.0, 2.0, 4.0]), np.zeros((3, 3, 3)))
+    >>> x, converged = jax.jit(descend)(problem, np.zeros(3))
+    >>> np.allclose(x, [1.0, 0.5, 0.25]), bool(converged)
+    (True, True)
+    """
     least = tolerance(start)
 
     def cost(x: Array) -> Array:
@@ -187,6 +236,16 @@ def minimise(problem: Quadratic, start: Array) -> tuple[Array, Array]:
     Returns
     -------
     The minimum (3,), and whether the search converged, ().
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry.quadratic_least_squares import Quadratic, minimise
+    >>> jaxekf.set_up()
+    >>> problem = Quadratic(-np.ones(3), np.diag([1.0, 2.0, 4.0]), np.zeros((3, 3, 3)))
+    >>> x, converged = jax.jit(minimise)(problem, np.zeros(3))
+    >>> np.asarray(x).round(9).tolist(), bool(converged)
+    ([1.0, 0.5, 0.25], True)
     """
     x, _ = descend(problem, start)
     # Undamped and with the full Hessian: exact to rounding, and a reliable test of convergence.

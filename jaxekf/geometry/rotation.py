@@ -111,7 +111,16 @@ def _rolled(vector: Array, by: int) -> Array:
 
 @_group
 def product(p: Array, q: Array) -> Array:
-    """Hamilton product ``p * q`` of quaternions, shapes (..., 4)."""
+    """Hamilton product ``p * q`` of quaternions, shapes (..., 4).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> _, i, j, _ = np.eye(4)
+    >>> rotation.product(i, j).tolist()  # i * j = k
+    [0.0, 0.0, 0.0, 1.0]
+    """
     pw, pv, qw, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
     real = pw * qw - jnp.sum(pv * qv, axis=-1, keepdims=True)
     return jnp.concatenate([real, pw * qv + qw * pv + cross(pv, qv)], axis=-1)
@@ -119,19 +128,47 @@ def product(p: Array, q: Array) -> Array:
 
 @_group
 def conjugate(q: Array) -> Array:
-    """Inverse of a unit quaternion, shape (..., 4)."""
+    """Inverse of a unit quaternion, shape (..., 4).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> q = rotation.exp(np.array([0.1, -0.2, 0.3]))
+    >>> np.allclose(rotation.product(rotation.conjugate(q), q), rotation.identity())
+    True
+    """
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 @_group
 def normalise(q: Array) -> Array:
-    """``q`` scaled to unit norm, shape (..., 4); ``q`` must not be zero."""
+    """``q`` scaled to unit norm, shape (..., 4); ``q`` must not be zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> rotation.normalise(np.array([0.0, 0.0, 0.0, 2.0])).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
     return q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
 
 
 @_group
 def keep_unit(q: Array) -> Array:
-    """``q``, of unit norm but for rounding, normalised by one Newton step without a division."""
+    """``q``, of unit norm but for rounding, normalised by one Newton step without a division.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> q = rotation.keep_unit(np.array([1.0 + 1e-8, 0.0, 0.0, 0.0]))
+    >>> bool(abs(q[0] - 1.0) < 1e-15)  # an error e becomes -1.5 e^2
+    True
+    """
     return q * (1.5 - 0.5 * jnp.sum(q * q, axis=-1, keepdims=True))
 
 
@@ -176,7 +213,17 @@ def _half_angle(delta: Array) -> tuple[Array, Array]:
 
 @_group
 def exp(delta: Array) -> Array:
-    """Quaternion of the rotation vector ``delta`` in radians, shapes (..., 3) to (..., 4)."""
+    """Quaternion of the rotation vector ``delta`` in radians, shapes (..., 3) to (..., 4).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> quarter_turn_about_z = rotation.exp(np.array([0.0, 0.0, np.pi / 2]))
+    >>> np.allclose(quarter_turn_about_z, np.sqrt([0.5, 0.0, 0.0, 0.5]))
+    True
+    """
     cosine, sine = _half_angle(delta)
     return jnp.concatenate([cosine[..., None], sine[..., None] * delta], axis=-1)
 
@@ -186,6 +233,15 @@ def log(q: Array) -> Array:
     """Rotation vector in radians, of length at most pi, shapes (..., 4) to (..., 3).
 
     ``q`` and ``-q`` give the same vector: the one with ``w >= 0`` is used.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> quarter_turn_about_z = np.sqrt([0.5, 0.0, 0.0, 0.5])
+    >>> np.rad2deg(rotation.log(quarter_turn_about_z)).round(9).tolist()
+    [0.0, 0.0, 90.0]
     """
     flip = jnp.where(q[..., :1] < 0.0, -1.0, 1.0)
     q = q * flip
@@ -205,7 +261,18 @@ def log(q: Array) -> Array:
 
 @_group
 def rotate(q: Array, vector: Array) -> Array:
-    """``vector`` rotated by ``q``, body to reference coordinates, shapes (..., 4), (..., 3) to (..., 3)."""
+    """``vector`` rotated by ``q``, body to reference coordinates, shapes (..., 4), (..., 3) to (..., 3).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> q_ref_body = np.sqrt([0.5, 0.0, 0.0, 0.5])  # a quarter turn about z
+    >>> x_of_body = np.array([1.0, 0.0, 0.0])
+    >>> np.allclose(rotation.rotate(q_ref_body, x_of_body), [0.0, 1.0, 0.0])  # y of the reference
+    True
+    """
     imaginary = q[..., 1:]
     twice_cross = 2.0 * cross(imaginary, vector)
     return vector + q[..., :1] * twice_cross + cross(imaginary, twice_cross)
@@ -213,13 +280,35 @@ def rotate(q: Array, vector: Array) -> Array:
 
 @_group
 def rotate_inverse(q: Array, vector: Array) -> Array:
-    """``vector`` rotated by the inverse of ``q``, reference to body coordinates."""
+    """``vector`` rotated by the inverse of ``q``, reference to body coordinates.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> q_ref_body = np.sqrt([0.5, 0.5, 0.0, 0.0])  # a quarter turn about x
+    >>> up_ref = np.array([0.0, 0.0, 1.0])
+    >>> np.allclose(rotation.rotate_inverse(q_ref_body, up_ref), [0.0, 1.0, 0.0])  # y of the body
+    True
+    """
     return rotate(conjugate(q), vector)
 
 
 @_group
 def to_matrix(q: Array) -> Array:
-    """Rotation matrix ``R`` with ``v_ref = R @ v_body``, shapes (..., 4) to (..., 3, 3)."""
+    """Rotation matrix ``R`` with ``v_ref = R @ v_body``, shapes (..., 4) to (..., 3, 3).
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> quarter_turn_about_z = np.sqrt([0.5, 0.0, 0.0, 0.5])
+    >>> matrix = rotation.to_matrix(quarter_turn_about_z)
+    >>> np.allclose(matrix, [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    True
+    """
     w, v = q[..., :1, None], q[..., 1:]
     outer = v[..., :, None] * v[..., None, :]
     real = 1.0 - 2.0 * jnp.sum(v * v, axis=-1)[..., None, None]
@@ -233,6 +322,14 @@ def from_matrix(matrix: Array) -> Array:
     Shepperd's method: the entries of ``R`` give ``4 q q'``, and the row of the largest component is
     used, so that no small number is a divisor, not even at 180 degrees. `matrix` is not checked for
     being a rotation.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> half_turn_about_x = np.diag([1.0, -1.0, -1.0])
+    >>> jax.jit(rotation.from_matrix)(half_turn_about_x).tolist()
+    [0.0, 1.0, 0.0, 0.0]
     """
     (a, b, c), (d, e, f), (g, h, i) = (tuple(matrix[..., j, k] for k in range(3)) for j in range(3))
     rows = [
@@ -252,12 +349,32 @@ def from_matrix(matrix: Array) -> Array:
 
 @_group
 def align(q: Array, near: Array) -> Array:
-    """``q`` or ``-q``, whichever is nearer to the quaternion `near`, shapes (..., 4)."""
+    """``q`` or ``-q``, whichever is nearer to the quaternion `near`, shapes (..., 4).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> measured = np.array([-1.0, 0.0, 0.0, 0.0])  # the same rotation as the identity
+    >>> np.allclose(rotation.align(measured, rotation.identity()), [1.0, 0.0, 0.0, 0.0])
+    True
+    """
     return jnp.where(jnp.sum(q * near, axis=-1, keepdims=True) < 0.0, -q, q)
 
 
 def difference(q: Array, r: Array) -> Array:
-    """Rotation vector from ``q`` to ``r`` in the body frame of ``q``: ``log(conj(q) * r)``."""
+    """Rotation vector from ``q`` to ``r`` in the body frame of ``q``: ``log(conj(q) * r)``.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> q, delta = rotation.exp(np.array([0.5, 0.0, -1.0])), np.array([0.0, 0.2, 0.0])
+    >>> r = rotation.product(q, rotation.exp(delta))
+    >>> np.allclose(rotation.difference(q, r), delta)
+    True
+    """
     return log(product(conjugate(q), r))
 
 
@@ -271,6 +388,16 @@ def right_jacobian(delta: Array) -> Array:
 
     ``I - (1 - cos a) / a^2 [delta] + (a - sin a) / a^3 [delta]^2`` (Sola, Deray, Atchuthan 2018, eq. 143),
     by half the angle, as `exp` has it: ``1 - cos a = 2 sin^2(a / 2)``, ``sin a = 2 sin(a / 2) cos(a / 2)``.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> delta, e = np.array([0.3, -0.2, 0.5]), np.array([1e-6, 2e-6, -1e-6])
+    >>> moved = rotation.difference(rotation.exp(delta), rotation.exp(delta + e))
+    >>> np.allclose(moved, jax.jit(rotation.right_jacobian)(delta) @ e, rtol=1e-5, atol=0.0)
+    True
     """
     cosine, sine = _half_angle(delta)
     squared = jnp.sum(delta * delta)
@@ -288,6 +415,17 @@ def inverse_right_jacobian(delta: Array) -> Array:
     """Inverse of `right_jacobian`, for vectors up to half a turn, shapes (3,) to (3, 3).
 
     ``I + [delta] / 2 + (1 - (a / 2) cot(a / 2)) / a^2 [delta]^2`` (Sola, Deray, Atchuthan 2018, eq. 144).
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation
+    >>> jaxekf.set_up()
+    >>> delta = np.array([0.3, -0.2, 0.5])
+    >>> jacobian = jax.jit(rotation.right_jacobian)(delta)
+    >>> inverse = jax.jit(rotation.inverse_right_jacobian)(delta)
+    >>> np.allclose(inverse @ jacobian, np.eye(3))
+    True
     """
     cosine, sine = _half_angle(delta)
     squared = jnp.sum(delta * delta)

@@ -27,7 +27,17 @@ from jaxekf.geometry import linalg, rotation
 
 
 class Attitude(NamedTuple):
-    """An attitude, and whether the vectors determine it."""
+    """An attitude, and whether the vectors determine it.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> x, y, _ = np.eye(3)
+    >>> found = jax.jit(triad.triad)(x, x, x, y)  # one direction only in the body frame
+    >>> bool(found.valid), found.q_ref_body.tolist()
+    (False, [1.0, 0.0, 0.0, 0.0])
+    """
 
     q_ref_body: Array
     """(4,) unit quaternion w, x, y, z that takes body coordinates to reference coordinates."""
@@ -37,7 +47,16 @@ class Attitude(NamedTuple):
 
 
 class References(NamedTuple):
-    """Reference directions: unit vectors that an accelerometer at rest and a magnetometer measure."""
+    """Reference directions: unit vectors that an accelerometer at rest and a magnetometer measure.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> horizontal = triad.References(up=np.array([0.0, 0.0, 1.0]), field=np.array([1.0, 0.0, 0.0]))
+    >>> np.allclose(horizontal, triad.north_west_up(dip=0.0))
+    True
+    """
 
     up: Array
     """(3,) direction of specific force at rest, opposite to gravity."""
@@ -52,6 +71,15 @@ def north_west_up(dip: Array | float) -> References:
     ----------
     dip
         Angle of the field below the horizontal, rad, positive in the northern hemisphere.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
+    >>> field = np.asarray(triad.north_west_up(np.deg2rad(60.0)).field)
+    >>> field.round(4).tolist()  # to the north and down
+    [0.5, 0.0, -0.866]
     """
     dip = jnp.asarray(dip, float)
     zero, one = jnp.zeros_like(dip), jnp.ones_like(dip)
@@ -67,6 +95,15 @@ def east_north_up(dip: Array | float, declination: Array | float = 0.0) -> Refer
         As in `north_west_up`, rad.
     declination
         Angle from true to magnetic north, rad, positive to the east; 0 for magnetic north.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
+    >>> east_of_north = triad.east_north_up(np.deg2rad(60.0), np.deg2rad(30.0))
+    >>> np.asarray(east_of_north.field).round(4).tolist()  # to the north-north-east and down
+    [0.25, 0.433, -0.866]
     """
     dip, declination = jnp.asarray(dip, float), jnp.asarray(declination, float)
     zero, one = jnp.zeros_like(dip), jnp.ones_like(dip)
@@ -104,6 +141,17 @@ def triad(
     least_sine
         Smallest sine of the angle between two vectors of a pair; by default the square root of the rounding
         error.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation, triad
+    >>> jaxekf.set_up()
+    >>> up, field = triad.north_west_up(np.deg2rad(60.0))
+    >>> q_ref_body = rotation.exp(np.array([0.3, 0.0, 0.1]))
+    >>> force, flux = (rotation.rotate_inverse(q_ref_body, v) for v in (9.81 * up, field))
+    >>> np.allclose(jax.jit(triad.triad)(force, flux, up, field).q_ref_body, q_ref_body)
+    True
     """
     body, body_valid = _triad_axes(first_body, second_body, least_sine)
     reference, reference_valid = _triad_axes(first_ref, second_ref, least_sine)
@@ -150,6 +198,17 @@ def triad_covariance(
     ------
     ArgumentError
         For a covariance of another shape.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
+    >>> (north, _, up), noise = np.eye(3), np.eye(3)
+    >>> covariance = jax.jit(triad.triad_covariance)
+    >>> cov = covariance(up, north, 0.01**2 * noise, 0.03**2 * noise)
+    >>> np.sqrt(np.diagonal(cov)).round(6).tolist()  # rad: tilt from `up`, heading from `north`
+    [0.01, 0.01, 0.03]
     """
     for cov in (first_cov, second_cov):
         # Any other shape would be broadcast, to a result that is no covariance.
@@ -175,13 +234,31 @@ def triad_covariance(
 
 
 def float_type(*arrays: Array) -> jnp.dtype:
-    """Floating-point type for computations on `arrays`."""
+    """Floating-point type for computations on `arrays`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> print(triad.float_type(np.zeros(3, np.float32), np.ones(3, np.float32)))
+    float32
+    """
     dtype = jnp.result_type(*arrays)
     return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
 def default_threshold(least: Array | float | None, dtype: jnp.dtype) -> Array | float:
-    """`least`, or by default the square root of the rounding error, at which half the digits remain."""
+    """`least`, or by default the square root of the rounding error, at which half the digits remain.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> f"{triad.default_threshold(None, np.dtype('float64')):.1e}"
+    '1.5e-08'
+    >>> triad.default_threshold(0.1, np.dtype("float64"))
+    0.1
+    """
     return float(jnp.finfo(dtype).eps) ** 0.5 if least is None else least
 
 
@@ -190,6 +267,14 @@ def directions(vector: Array) -> tuple[Array, Array]:
 
     The largest component is divided out first, so that squares neither overflow nor underflow. The
     result does not depend on that factor, which is therefore a constant under differentiation.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> unit, usable = jax.jit(triad.directions)(np.array([[0.0, 0.0, 9.81], [0.0, 0.0, 0.0]]))
+    >>> np.allclose(unit, [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), usable.tolist()
+    (True, [True, False])
     """
     largest = lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1))
     # A comparison with NaN is False.
@@ -200,7 +285,17 @@ def directions(vector: Array) -> tuple[Array, Array]:
 
 
 def attitude_or(q: Array, valid: Array, near: Array | None, fallback: Array | None) -> Attitude:
-    """``q`` with the sign nearer to `near` if `valid`, else `fallback` or the identity."""
+    """``q`` with the sign nearer to `near` if `valid`, else `fallback` or the identity.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.geometry import triad
+    >>> jaxekf.set_up()
+    >>> half_turn_about_x = np.array([0.0, 1.0, 0.0, 0.0])
+    >>> triad.attitude_or(half_turn_about_x, np.array(False), None, None).q_ref_body.tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
     if near is not None:
         q = rotation.align(q, jnp.asarray(near, q.dtype))
     other = rotation.identity() if fallback is None else fallback

@@ -27,7 +27,19 @@ from jaxekf.geometry import linalg, manifold
 
 
 class Moments(NamedTuple):
-    """Result of the transform."""
+    """Result of the transform.
+
+    Examples
+    --------
+    >>> import jax, numpy as np
+    >>> from jaxekf.geometry import unscented
+    >>> @jax.jit
+    ... def of_a_line(mean, cov):
+    ...     return unscented.transform(lambda x: 2.0 * x + 1.0, mean, cov)
+    >>> found = of_a_line(np.zeros(1), np.eye(1))
+    >>> [round(np.asarray(part).item(), 4) for part in found]  # mean, cov, cross
+    [1.0, 4.0, 2.0]
+    """
 
     mean: Any
     """(m,); for `transform_on` a point of the output's space."""
@@ -78,6 +90,18 @@ def transform(
     ------
     ArgumentError
         If ``alpha^2 (n + kappa)`` is not positive, or if the shapes do not match.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import unscented
+    >>> jaxekf.set_up()
+    >>> @jax.jit
+    ... def of_a_square(mean, cov):
+    ...     return unscented.transform(lambda x: x**2, mean, cov, kappa=2.0)
+    >>> found = of_a_square(np.array([3.0]), np.array([[0.25]]))
+    >>> np.allclose(found.mean, 3.0**2 + 0.25), np.allclose(found.cov, 36.0 * 0.25 + 2.0 * 0.25**2)
+    (True, True)
     """
     mean, cov = jnp.asarray(mean), jnp.asarray(cov)
     size = mean.shape[0] if mean.ndim == 1 else -1
@@ -139,6 +163,18 @@ def transform_on(
         Manifolds or NamedTuples of manifolds (`jaxekf.geometry.manifold`).
     alpha, beta, kappa
         As in `transform`.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation, unscented
+    >>> jaxekf.set_up()
+    >>> so3, cov = jaxekf.SO3(), np.diag([1e-4, 4e-4, 9e-4])  # rad^2, body frame
+    >>> @jax.jit
+    ... def of_the_inverse(q, cov):
+    ...     return unscented.transform_on(rotation.conjugate, q, cov, so3, so3)
+    >>> np.allclose(of_the_inverse(rotation.identity(), cov).cov, cov)
+    True
     """
     centre = fn(mean)
 

@@ -41,6 +41,17 @@ def q_method(
         Smallest gap between the two largest eigenvalues, as a share of the total weight, by default
         the square root of the rounding error. A smaller gap leaves a rotation undetermined (collinear
         or contradictory directions), and the result is `fallback`.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import rotation, wahba
+    >>> jaxekf.set_up()
+    >>> q_ref_body = rotation.exp(np.array([0.3, 0.0, 0.1]))
+    >>> reference = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
+    >>> body = rotation.rotate_inverse(q_ref_body, reference)
+    >>> np.allclose(jax.jit(wahba.q_method)(body, reference).q_ref_body, q_ref_body)
+    True
     """
     b, r, share = _pairs(body, reference, weights)
     profile = jnp.sum(share[:, None, None] * r[:, :, None] * b[:, None, :], axis=0)
@@ -81,6 +92,15 @@ def q_method_covariance(
     Returns
     -------
     (3, 3); the identity, a standard deviation of one radian, if a rotation is undetermined.
+
+    Examples
+    --------
+    >>> import jax, jaxekf, numpy as np
+    >>> from jaxekf.geometry import wahba
+    >>> jaxekf.set_up()
+    >>> cov = jax.jit(wahba.q_method_covariance)(np.eye(3), np.full(3, 0.01))
+    >>> np.sqrt(np.diagonal(cov)).round(6).tolist()  # 0.01 / sqrt(2): two directions see each axis
+    [0.007071, 0.007071, 0.007071]
     """
     deviations = jnp.asarray(deviations, float_type(body, deviations))
     positive = (deviations > 0.0) & jnp.isfinite(deviations)

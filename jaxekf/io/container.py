@@ -38,7 +38,14 @@ _LONGEST_INFO = 60_000
 
 
 def is_container(path: Path | str) -> bool:
-    """Whether a path is by its suffix (.h5, .hdf5, .npz) that of a run in one file."""
+    """Whether a path is by its suffix (.h5, .hdf5, .npz) that of a run in one file.
+
+    Examples
+    --------
+    >>> from jaxekf.io import container
+    >>> container.is_container("run.h5"), container.is_container("run")
+    (True, False)
+    """
     return Path(path).suffix.lower() in SUFFIXES
 
 
@@ -47,6 +54,19 @@ def save(recording: Recording, path: Path | str, *, overwrite: bool = False) -> 
 
     `load` gives every number again to the last bit, those of hidden rows too. Raises `RecordingError` where
     the file may not be written, or the run could not be read again.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jaxekf
+    >>> from jaxekf.io import container
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = container.save(run, Path(folder) / "free-5.npz")
+    ...     again = jaxekf.load(file)
+    >>> bool((again.need_imu().gyroscope == run.need_imu().gyroscope).all())
+    True
     """
     path = _known(path)
     entries = _entries(recording, path)

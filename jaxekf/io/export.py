@@ -36,7 +36,14 @@ class Entry(NamedTuple):
 
 
 def format_of(path: Path | str) -> str:
-    """The format of a file by its suffix: csv, npz, hdf5 or tum."""
+    """The format of a file by its suffix: csv, npz, hdf5 or tum.
+
+    Examples
+    --------
+    >>> from jaxekf.io import export
+    >>> export.format_of("estimate.npz"), export.format_of("estimate.h5")
+    ('npz', 'hdf5')
+    """
     suffix = Path(path).suffix
     if suffix.lower() not in _SUFFIXES:
         raise RecordingError(
@@ -101,6 +108,18 @@ def write_tum(
     `q_ref_body` (N, 4) is w, x, y, z and `position` (N, 3) in metres, zero where there is none. Times are
     seconds with nine decimals, exact; other numbers have 17 digits, which lose nothing. Instants whose
     pose is not finite have no line; a comment at the head has their number.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from jaxekf.io import export
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "trajectory.txt"
+    ...     export.write_tum(file, np.array([1_500_000_000]), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    ...     print(file.read_text("utf-8").splitlines()[-1])
+    1.500000000 0 0 0 0 0 0 1
     """
     notes = ["timestamp tx ty tz qx qy qz qw (s, m, body to reference)", *comments]
     if position is None:

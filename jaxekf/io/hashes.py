@@ -18,6 +18,13 @@ def hashed(folder_or_file: Path | str) -> dict[str, str]:
     Of a recorded run's folder these are `recording.toml` and the CSV files of streams and landmarks; of a
     folder in another layout all tables and descriptions in it, by their paths in there; of a file that
     file. What cannot be read is left out.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.io import hashes
+    >>> list(hashes.hashed(jaxekf.demo.FOLDER / "free-5"))
+    ['encoder.csv', 'imu.csv', 'optical.csv', 'recording.toml']
     """
     path = Path(folder_or_file)
     if not path.is_dir():

@@ -144,7 +144,15 @@ def _check_hash(table: Table, hashes: Mapping[str, str]) -> None:
 
 
 def load_imu(path: Path | str) -> Recording:
-    """An IMU alone, from a CSV file with the columns of `imu.csv`."""
+    """An IMU alone, from a CSV file with the columns of `imu.csv`.
+
+    Examples
+    --------
+    >>> import jaxekf, jaxekf.io
+    >>> run = jaxekf.io.load_imu(jaxekf.demo.FOLDER / "free-5" / "imu.csv")
+    >>> list(run.streams), run.need_imu().gyroscope.shape  # rad/s
+    (['imu'], (3001, 3))
+    """
     file = Path(path)
     table, section = read_unit_row(read_table(file), SCHEMAS["imu"], {}, file)
     imu, account = SCHEMAS["imu"].read_table(table, Source(section, file, False))
@@ -153,7 +161,16 @@ def load_imu(path: Path | str) -> Recording:
 
 
 def read_log(path: Path | str) -> Recording:
-    """A recorded run, or a CSV file with the columns of `imu.csv`."""
+    """A recorded run, or a CSV file with the columns of `imu.csv`.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.io import run_folder
+    >>> folder = jaxekf.demo.FOLDER / "free-5"
+    >>> [list(run_folder.read_log(path).streams) for path in (folder, folder / "imu.csv")]
+    [['optical', 'imu', 'encoder'], ['imu']]
+    """
     alone = Path(path).is_file() and not container.is_container(path)
     return load_imu(path) if alone else load(path)
 

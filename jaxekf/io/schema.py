@@ -109,7 +109,15 @@ def validity() -> Field:
 
 
 def triple(head: str, unit: str, frame: str, about: str, *, needed: bool = False) -> Field:
-    """A vector with the columns `head` and x, y, z."""
+    """A vector with the columns `head` and x, y, z.
+
+    Examples
+    --------
+    >>> from jaxekf.io import schema
+    >>> force = schema.triple("f", "N", "sensor", "force")
+    >>> force.columns, force.shape, force.unit
+    (('fx', 'fy', 'fz'), ('N', 3), 'N')
+    """
     columns = tuple(f"{head}{axis}" for axis in "xyz")
     return Field(
         shape=("N", 3), unit=unit, frame=frame, needed=needed, columns=columns, about=about

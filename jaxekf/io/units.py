@@ -26,7 +26,14 @@ def factors(
     label: str, units: Sequence[str], about: Mapping[str, Any], place: Path | str
 ) -> tuple[float, ...]:
     """Size of each stated unit, ``unit = "deg/s, g"``, in the SI `units` of a stream; 1 where none is
-    stated."""
+    stated.
+
+    Examples
+    --------
+    >>> from jaxekf.io import units
+    >>> units.factors("optical", ["m"], {"unit": "mm"}, "recording.toml")
+    (0.001,)
+    """
     known = [UNITS.get(unit, {unit: 1.0}) for unit in units]
     value = about.get("unit")
     parts = [part.strip() for part in value.split(",")] if isinstance(value, str) else []

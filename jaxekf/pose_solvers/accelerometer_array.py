@@ -139,6 +139,17 @@ def differences(array: AccelerometerArray, noise: Array | float) -> Differences:
     ------
     ArgumentError
         If the shapes do not match.
+
+    Examples
+    --------
+    >>> import jax, jaxekf
+    >>> from jaxekf.pose_solvers import accelerometer_array
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> jaxekf.set_up()
+    >>> array = gyro_free_runs.handheld_array()
+    >>> prepared = jax.jit(accelerometer_array.differences)(array, 1e-3)
+    >>> int(prepared.independent), bool(prepared.degenerate)  # six axes less the specific force
+    (3, False)
     """
     positions, axes = jnp.asarray(array.positions), jnp.asarray(array.axes)
     if positions.ndim != 2 or positions.shape[1] != 3 or axes.shape != positions.shape:

@@ -68,6 +68,16 @@ def absolute_orientation(p_body_marker: Floats, position: Floats, usable: Flags)
         (N, M, 3) metres, reference frame.
     usable
         (N, M) visible markers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.pose_solvers import marker_pose
+    >>> p_body_marker = 0.1 * np.eye(3)
+    >>> turned = p_body_marker[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]  # a quarter turn about z
+    >>> pose = marker_pose.absolute_orientation(p_body_marker, turned[None], np.ones((1, 3), bool))
+    >>> np.allclose(pose.q_ref_body, np.sqrt([0.5, 0.0, 0.0, 0.5])), bool(pose.valid[0])
+    (True, True)
     """
     p_body_marker = arrays.floats(p_body_marker, arrays.argument("p_body_marker"), (None, 3))
     position = arrays.floats(position, arrays.argument("position"), (None, len(p_body_marker), 3))

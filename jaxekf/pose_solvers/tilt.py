@@ -29,7 +29,18 @@ _SLOWEST_MEAN = np.deg2rad(2.0)
 
 
 def integrated_attitude(imu: Imu) -> Floats:
-    """Quaternions (N, 4) from the body at each sample to the body at the first, by the gyroscope alone."""
+    """Quaternions (N, 4) from the body at each sample to the body at the first, by the gyroscope alone.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.pose_solvers import tilt
+    >>> time_ns = np.arange(101) * 10_000_000  # 1 s
+    >>> rate = np.tile([0.0, 0.0, np.pi / 2], (101, 1))
+    >>> q_first_last = tilt.integrated_attitude(jaxekf.Imu(time_ns, rate))[-1]
+    >>> np.allclose(q_first_last, np.sqrt([0.5, 0.0, 0.0, 0.5]))
+    True
+    """
     step = np.diff(imu.time_ns) / NANOSECONDS
     angle = 0.5 * (imu.gyroscope[1:] + imu.gyroscope[:-1]) * step[:, None]
     q = running_product(from_scipy(Rotation.from_rotvec(angle)))
@@ -48,6 +59,15 @@ def up_in_body(imu: Imu, settling_s: float = _SETTLING_S) -> Floats:
         Samples with specific forces.
     settling_s
         Time constant of the second-order Butterworth low-pass, s.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.pose_solvers import tilt
+    >>> time_ns, rest = np.arange(201) * 10_000_000, np.zeros((201, 3))
+    >>> imu = jaxekf.Imu(time_ns, rest, accelerometer=np.tile([0.0, 0.0, 9.81], (201, 1)))
+    >>> np.allclose(tilt.up_in_body(imu)[-1], [0.0, 0.0, 1.0])
+    True
     """
     # Slow to import, and every model is imported with this module.
     from scipy.signal import butter, sosfilt, sosfilt_zi

@@ -34,7 +34,17 @@ from jaxekf.recordings.types import (
 
 @dataclass(frozen=True)
 class SensorGrade:
-    """Noise and rates of the simulated sensors."""
+    """Noise and rates of the simulated sensors.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import attitude_runs
+    >>> slow = attitude_runs.SensorGrade(optical_hz=20.0)
+    >>> motion = attitude_runs.free_motion(1)
+    >>> run = attitude_runs.recording("slow", motion, seed=1, duration_s=5.0, grade=slow)
+    >>> len(run.need_optical().time_ns)
+    101
+    """
 
     gyroscope_deg: float = 0.05
     """White noise of the rate, deg/s/sqrt(Hz)."""
@@ -65,6 +75,15 @@ class Motion:
 
     ``q(t) = exp(a_z(t) e_z) exp(a_y(t) e_y) exp(a_x(t) e_x)`` with
     ``a(t) = rate * ramp(t) + sum(amplitude * sin(2 pi f t + phase))``, minus its value at 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation.attitude_runs import Motion
+    >>> about_z = Motion(rate=(0.0, 0.0, np.pi / 2))  # rad/s: a quarter turn in a second
+    >>> q_ref_body, rate = about_z.attitude(np.array([1.0]))
+    >>> np.allclose(q_ref_body, np.sqrt([0.5, 0.0, 0.0, 0.5])), np.allclose(rate, [0.0, 0.0, np.pi / 2])
+    (True, True)
     """
 
     rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -104,7 +123,17 @@ class Motion:
 
 
 def constant_rate_motion(rate_deg: float = -9.0, rest_s: float = 10.0) -> Motion:
-    """The paper's experiment: a robot joint rotates about x at constant rate after a rest."""
+    """The paper's experiment: a robot joint rotates about x at constant rate after a rest.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import attitude_runs
+    >>> motion = attitude_runs.constant_rate_motion(rate_deg=-9.0, rest_s=10.0)
+    >>> angles, _ = motion.angles(np.array([5.0, 20.0]))
+    >>> np.allclose(np.rad2deg(angles[:, 0]), [0.0, -90.0])
+    True
+    """
     return Motion(rate=(np.deg2rad(rate_deg), 0.0, 0.0), rest_s=rest_s)
 
 
@@ -112,6 +141,16 @@ def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> M
     """A smooth random rotation about all axes, of about `speed_deg` deg/s rms in roll and yaw.
 
     Pitch stays within 70 deg, so that roll and yaw remain meaningful in a plot.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import attitude_runs
+    >>> motion = attitude_runs.free_motion(1, rest_s=2.0)
+    >>> _, rate = motion.attitude(np.linspace(0.0, 10.0, 101))
+    >>> moving = np.linalg.norm(rate, axis=1) > 0.0
+    >>> bool(moving[:20].any()), bool(moving[21:].all())
+    (False, True)
     """
     rng = np.random.default_rng([seed, 1])
     frequency = rng.uniform(0.15, 0.9, (3, 4))
@@ -124,7 +163,14 @@ def free_motion(seed: int, *, speed_deg: float = 40.0, rest_s: float = 2.0) -> M
 
 
 def sample_times(hertz: float, duration_s: float, start_ns: int) -> Times:
-    """Regular sampling times, ns."""
+    """Regular sampling times, ns.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import attitude_runs
+    >>> attitude_runs.sample_times(62.5, 0.048, start_ns=0).tolist()
+    [0, 16000000, 32000000, 48000000]
+    """
     count = int(np.floor(duration_s * hertz + 1e-9)) + 1
     return start_ns + np.round(np.arange(count) / hertz * NANOSECONDS).astype(np.int64)
 
@@ -163,6 +209,18 @@ def recording(
         Time of the first samples, ns.
     marker_body
         (3,) m, body frame: the point whose position the tracker reports; the tool rotates about the origin.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import attitude_runs
+    >>> motion = attitude_runs.free_motion(1)
+    >>> run = attitude_runs.recording("run", motion, seed=1, duration_s=5.0, occlusions=[(2.0, 3.0)])
+    >>> list(run.streams)
+    ['optical', 'imu', 'encoder']
+    >>> optical = run.need_optical()
+    >>> hidden = optical.time_ns[~optical.valid] / 1e9  # s
+    >>> round(float(hidden.min()), 1), round(float(hidden.max()), 1)
+    (2.0, 3.0)
     """
     grade = grade or SensorGrade()
     rng = np.random.default_rng([seed, 0])
@@ -186,7 +244,15 @@ def recording(
 
 
 def seconds(times: Times) -> Floats:
-    """Seconds since the first."""
+    """Seconds since the first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import attitude_runs
+    >>> attitude_runs.seconds(np.array([1_700_000_000_000_000_000, 1_700_000_000_016_000_000])).tolist()
+    [0.0, 0.016]
+    """
     return (times - times[0]) / NANOSECONDS
 
 

@@ -26,7 +26,16 @@ y), its y down (against the scene's x)."""
 
 @dataclass(frozen=True)
 class CameraGrade:
-    """Noise and rates of camera and IMU."""
+    """Noise and rates of camera and IMU.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import camera_runs
+    >>> few = camera_runs.CameraGrade(points=6)
+    >>> run = camera_runs.camera_recording("camera", seed=1, duration_s=1.0, grade=few)
+    >>> int(run.camera.visible.sum(axis=1).max())  # landmarks of an image
+    6
+    """
 
     imu: ToolGrade = field(
         default_factory=lambda: ToolGrade(
@@ -52,7 +61,17 @@ class CameraGrade:
 
 @dataclass(frozen=True)
 class Mount:
-    """Pose of the camera in the body, and its lens."""
+    """Pose of the camera in the body, and its lens.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import camera_runs
+    >>> mount = camera_runs.Mount(radial=np.zeros(2))  # a lens without distortion
+    >>> run = camera_runs.camera_recording("camera", seed=1, duration_s=1.0, mount=mount)
+    >>> run.camera.radial.tolist()
+    [0.0, 0.0]
+    """
 
     p_body_camera: Floats = field(default_factory=lambda: np.array([0.03, -0.02, 0.05]))
     q_body_camera: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
@@ -70,7 +89,16 @@ class Facing(Motion):
 
 
 def eight(seed: int = 0) -> ToolMotion:
-    """The eight, 2.6 m wide and 1.1 m high, in front of the wall; `seed` varies the sway of the body."""
+    """The eight, 2.6 m wide and 1.1 m high, in front of the wall; `seed` varies the sway of the body.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import camera_runs
+    >>> path = camera_runs.eight().position(np.linspace(0.0, camera_runs.PERIOD_S, 1001))
+    >>> np.ptp(path[:, :2], axis=0).round(2).tolist()  # height and width, m
+    [1.1, 2.6]
+    """
     rng = np.random.default_rng([seed, 31])
     once = 1.0 / PERIOD_S
     # x up, y along the wall, z to it: sums of a constant (a sinusoid of frequency 0) and sinusoids.
@@ -89,6 +117,14 @@ def shaken(seed: int = 0) -> ToolMotion:
     """A hand that rotates and shakes the camera in front of the wall, by up to 20 deg and some 2 rad/s.
 
     This motion determines the camera's pose in the body.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import camera_runs
+    >>> _, rate = camera_runs.shaken().attitude.attitude(np.linspace(0.0, 10.0, 1001))
+    >>> 0.5 < float(np.linalg.norm(rate, axis=1).max()) < 3.0  # rad/s
+    True
     """
     rng = np.random.default_rng([seed, 34])
     size = (3, 2)
@@ -108,7 +144,15 @@ def shaken(seed: int = 0) -> ToolMotion:
 
 
 def resting() -> ToolMotion:
-    """A static body at the middle of the eight, facing the wall."""
+    """A static body at the middle of the eight, facing the wall.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import camera_runs
+    >>> camera_runs.resting().position(np.array([0.0, 5.0])).round(6).tolist()
+    [[1.4, 0.0, -2.6], [1.4, 0.0, -2.6]]
+    """
     nothing = np.zeros((3, 1))
     place, up = np.array([[1.4], [0.0], [-2.6]]), np.full((3, 1), np.pi / 2)
     still = Facing(amplitude=nothing, frequency=nothing, phase=nothing)
@@ -116,7 +160,15 @@ def resting() -> ToolMotion:
 
 
 def scene(seed: int = 0, count: int = 160) -> Floats:
-    """Landmarks (count, 3), m: half of them on the wall (z = 0), half on the floor (x = 0)."""
+    """Landmarks (count, 3), m: half of them on the wall (z = 0), half on the floor (x = 0).
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import camera_runs
+    >>> points = camera_runs.scene(count=10)
+    >>> points[:5, 2].tolist(), points[5:, 0].tolist()  # wall and floor
+    ([0.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0])
+    """
     rng = np.random.default_rng([seed, 32])
     wall = count // 2
     points = np.zeros((count, 3))
@@ -159,6 +211,14 @@ def camera_recording(
         (start, end) in seconds without detections.
     start_ns
         Time of the first samples, ns.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import camera_runs
+    >>> run = camera_runs.camera_recording("camera", seed=1, duration_s=2.0, blind=((0.5, 1.0),))
+    >>> seen, t = run.camera.visible.any(axis=1), run.camera.time_ns / 1e9  # s
+    >>> list(run.streams), bool(seen[(t > 0.5) & (t < 1.0)].any())
+    (['camera', 'imu', 'encoder'], False)
     """
     return camera_run(
         name,
@@ -185,7 +245,15 @@ def camera_run(
     blind: tuple[tuple[float, float], ...] = (),
     start_ns: int = 0,
 ) -> tuple[Recording, Unrecorded]:
-    """The same as `camera_recording`, with the ground truth that a recording does not hold."""
+    """The same as `camera_recording`, with the ground truth that a recording does not hold.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import camera_runs
+    >>> run, truth = camera_runs.camera_run("camera", seed=1, duration_s=1.0)
+    >>> truth.accelerometer_bias.shape == run.need_imu().accelerometer.shape
+    True
+    """
     grade, mount = grade or CameraGrade(), mount or Mount()
     motion = eight(seed) if motion is None else motion
     landmarks = scene() if landmarks is None else landmarks

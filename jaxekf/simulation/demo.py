@@ -27,12 +27,29 @@ _SPEEDS_DEG = (20.0, 45.0, 80.0, 35.0, 60.0, 30.0)
 
 
 def paths(names: tuple[str, ...]) -> list[Path]:
-    """Folders of the bundled runs."""
+    """Folders of the bundled runs.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> [path.name for path in jaxekf.demo.paths(jaxekf.demo.TRAINING)]
+    ['free-1', 'free-2', 'free-3']
+    """
     return [FOLDER / name for name in names]
 
 
 def make() -> list[Recording]:
-    """The bundled runs, simulated anew; reproducible but for rounding in the CSV files."""
+    """The bundled runs, simulated anew; reproducible but for rounding in the CSV files.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import jaxekf
+    >>> made = {run.name: run for run in jaxekf.demo.make()}
+    >>> kept = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> np.allclose(made["free-5"].need_imu().gyroscope, kept.need_imu().gyroscope, atol=1e-5)
+    True
+    """
     record = partial(attitude_runs.recording, duration_s=_DURATION_S, grade=_GRADE)
     motion, hidden = attitude_runs.constant_rate_motion(rest_s=6.0), [(16.0, 16.5)]
     runs = [record("constant-rate", motion, seed=100, occlusions=hidden, start_ns=_START_NS)]

@@ -45,7 +45,15 @@ _BLOCK = 20_000
 
 @dataclass(frozen=True)
 class SurgeryGrade:
-    """Noise and rate of the sensors; the defaults are an ADXL-203 and an HMC-2003."""
+    """Noise and rate of the sensors; the defaults are an ADXL-203 and an HMC-2003.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> grade = gyro_free_runs.SurgeryGrade(accelerometer_ug=100.0, hertz=400.0)
+    >>> round(float(grade.acceleration_sigma / grade.acceleration_density), 6)  # sqrt(400)
+    20.0
+    """
 
     accelerometer_ug: float = 110.0
     """White noise of each accelerometer, micro-g/sqrt(Hz)."""
@@ -75,7 +83,16 @@ class SurgeryGrade:
 
 
 class ArrayRun(NamedTuple):
-    """Readings of an array and a magnetometer, with the ground truth at the same times."""
+    """Readings of an array and a magnetometer, with the ground truth at the same times.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> motion, array = gyro_free_runs.surgical_motion(1), gyro_free_runs.handheld_array()
+    >>> run = gyro_free_runs.array_run(motion, array, seed=1, duration_s=1.0)
+    >>> run.readings.shape, run.field.shape, run.rate.shape
+    ((501, 6), (501, 3), (501, 3))
+    """
 
     time_ns: Times
     readings: Floats
@@ -93,6 +110,14 @@ def handheld_array(half_edge_m: float = 0.025) -> AccelerometerArray:
 
     No two corners share an edge. The midpoint of the two chips with the same sensitive axis is then on that
     axis, and the mean of their readings is free of angular acceleration; see `mean_force`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> array = gyro_free_runs.handheld_array(half_edge_m=0.025)
+    >>> np.allclose(np.linalg.norm(array.positions, axis=1), np.sqrt(3.0) * 0.025)
+    True
     """
     corners = half_edge_m * jnp.array([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, -1.0]])
     return accelerometer_array.three_dual_axis(*corners)
@@ -102,6 +127,14 @@ def surgical_motion(seed: int, *, body_acceleration: bool = True) -> ToolMotion:
     """A random hand motion at a microscope: tremor and voluntary motion in all six degrees of freedom.
 
     Without `body_acceleration` the body's origin is at rest and the body only rotates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> motion = gyro_free_runs.surgical_motion(1, body_acceleration=False)
+    >>> bool(motion.acceleration(np.array([0.0, 1.0])).any())
+    False
     """
     rng = np.random.default_rng([seed, 11])
     tremor_m, voluntary_m = 1e-6 * TREMOR_UM, 1e-3 * VOLUNTARY_MM
@@ -137,6 +170,15 @@ def angular_acceleration(motion: Motion, t: Floats) -> Floats:
 
     The derivative of ``rate = e_x a_x' + v a_y' + u a_z'``, with v and u the axes of the rotations about y
     and z in the body frame: ``v = R_x' e_y`` and ``u = R_x' R_y' e_z``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import attitude_runs, gyro_free_runs
+    >>> motion, t, h = attitude_runs.free_motion(1, rest_s=0.0), np.array([1.0]), 1e-6
+    >>> slope = (motion.attitude(t + h)[1] - motion.attitude(t - h)[1]) / (2.0 * h)
+    >>> np.allclose(gyro_free_runs.angular_acceleration(motion, t), slope, atol=1e-5)
+    True
     """
     angle, speed = motion.angles(t)
     (x, y, _), (dx, dy, dz) = angle.T, speed.T
@@ -162,7 +204,18 @@ def angular_acceleration(motion: Motion, t: Floats) -> Floats:
 
 
 def specific_forces(motion: ToolMotion, array: AccelerometerArray, t: Floats) -> Floats:
-    """Specific force along each axis of an array (N, n), m/s^2, at times t (N,), s."""
+    """Specific force along each axis of an array (N, n), m/s^2, at times t (N,), s.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import camera_runs, gyro_free_runs
+    >>> array, t = gyro_free_runs.handheld_array(), np.zeros(1)
+    >>> forces = gyro_free_runs.specific_forces(camera_runs.resting(), array, t)
+    >>> force = gyro_free_runs.mean_force(array, forces)
+    >>> np.linalg.norm(force, axis=1).round(2).tolist()  # m/s^2: gravity alone
+    [9.81]
+    """
     q, rate = motion.attitude.attitude(t)
     force = to_scipy(q).inv().apply(motion.acceleration(t) - GRAVITY_REF)
     acceleration = angular_acceleration(motion.attitude, t)
@@ -200,6 +253,14 @@ def array_run(
         Noise and rate of the sensors.
     start_ns
         Time of the first sample, ns.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> motion, array = gyro_free_runs.surgical_motion(1), gyro_free_runs.handheld_array()
+    >>> run = gyro_free_runs.array_run(motion, array, seed=1, duration_s=1.0)
+    >>> run.readings.shape  # samples, accelerometer axes
+    (501, 6)
     """
     grade = grade or SurgeryGrade()
     rng = np.random.default_rng([seed, 12])
@@ -231,6 +292,15 @@ def mean_force(array: AccelerometerArray, readings: Floats) -> Floats:
     component is the mean of two axes. Its noise is independent of that of the rate, which uses the
     residuals. The remaining rigid-body terms stay in; for `handheld_array`, at its origin, these are
     the centripetal terms, some mm/s^2 at a rate of 0.3 rad/s.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> array, force = gyro_free_runs.handheld_array(), np.array([0.0, 0.0, 9.81])
+    >>> readings = force @ np.asarray(array.axes).T  # at rest
+    >>> np.allclose(gyro_free_runs.mean_force(array, readings[None]), force)
+    True
     """
     return readings @ np.linalg.pinv(np.asarray(array.axes)).T
 
@@ -252,6 +322,17 @@ def array_rate(
     It uses `jaxekf.pose_solvers.gyro_free_rate.track` with `forget_s`, and `restored`: the errors are the
     initial rate and a random walk (`rate_walk`). The rate is early by half an interval, as the backward
     difference of eq. 3 takes the angular acceleration at a sample for that of the previous interval.
+
+    Examples
+    --------
+    >>> import jaxekf, numpy as np
+    >>> from jaxekf.simulation import gyro_free_runs
+    >>> jaxekf.set_up()
+    >>> motion, array = gyro_free_runs.surgical_motion(1), gyro_free_runs.handheld_array()
+    >>> run = gyro_free_runs.array_run(motion, array, seed=1, duration_s=1.0)
+    >>> rate = gyro_free_runs.array_rate(array, run.readings, gyro_free_runs.SurgeryGrade())
+    >>> rate.shape == run.rate.shape, bool(np.isfinite(rate).all())
+    (True, True)
     """
     require_float64()
     sigma, interval = grade.acceleration_sigma, 1.0 / grade.hertz

@@ -16,7 +16,17 @@ GRAVITY_REF = np.array(constants.GRAVITY_REF)
 
 @dataclass(frozen=True)
 class ToolGrade:
-    """Noise and rates of IMU and tracker; the defaults are an ADIS16350 and Tobergte's tracker (2009)."""
+    """Noise and rates of IMU and tracker; the defaults are an ADIS16350 and Tobergte's tracker (2009).
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import marker_runs
+    >>> motion = marker_runs.sinusoidal_motion()
+    >>> sparse = marker_runs.ToolGrade(tracker_s=0.1)
+    >>> run = marker_runs.tool_recording("tool", motion, seed=1, duration_s=2.0, grade=sparse)
+    >>> run.markers.position.shape  # frames, markers, m
+    (21, 3, 3)
+    """
 
     gyroscope_deg: float = 0.05
     """White noise of the rate, deg/s/sqrt(Hz)."""
@@ -40,7 +50,17 @@ class ToolGrade:
 
 @dataclass(frozen=True)
 class ToolMotion:
-    """A smooth pose over time: `Motion` for the attitude, sinusoids for the position."""
+    """A smooth pose over time: `Motion` for the attitude, sinusoids for the position.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> motion, t, h = marker_runs.sinusoidal_motion(), np.array([1.0]), 1e-6
+    >>> slope = (motion.position(t + h) - motion.position(t - h)) / (2.0 * h)
+    >>> np.allclose(motion.velocity(t), slope)
+    True
+    """
 
     attitude: Motion
     amplitude: Floats
@@ -69,7 +89,16 @@ class ToolMotion:
 
 
 def sinusoidal_motion() -> ToolMotion:
-    """One sinusoid in each of the six degrees of freedom, as in the simulation of Tobergte (2009)."""
+    """One sinusoid in each of the six degrees of freedom, as in the simulation of Tobergte (2009).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> t = np.linspace(0.0, 20.0, 2001)
+    >>> np.abs(marker_runs.sinusoidal_motion().position(t)).max(axis=0).round(3).tolist()  # m
+    [0.05, 0.04, 0.03]
+    """
     attitude = Motion(
         amplitude=np.deg2rad([[10.0], [8.0], [12.0]]),
         frequency=np.array([[0.3], [0.25], [0.2]]),
@@ -84,7 +113,16 @@ def sinusoidal_motion() -> ToolMotion:
 
 
 def free_tool_motion(seed: int) -> ToolMotion:
-    """A random smooth hand motion: some 10 cm and 0.5 rad, below 1 Hz."""
+    """A random smooth hand motion: some 10 cm and 0.5 rad, below 1 Hz.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> position = marker_runs.free_tool_motion(1).position(np.linspace(0.0, 20.0, 2001))
+    >>> bool((np.abs(position) < 0.15).all())  # m
+    True
+    """
     rng = np.random.default_rng([seed, 2])
     size = (3, 3)
     attitude = Motion(
@@ -102,7 +140,17 @@ def free_tool_motion(seed: int) -> ToolMotion:
 
 @dataclass(frozen=True)
 class Tool:
-    """Marker positions in the IMU's frame."""
+    """Marker positions in the IMU's frame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> tool = marker_runs.Tool(("a", "b", "c", "d"), 0.1 * np.vstack([np.zeros(3), np.eye(3)]))
+    >>> motion = marker_runs.free_tool_motion(1)
+    >>> marker_runs.tool_recording("t", motion, seed=1, duration_s=1.0, tool=tool).markers.names
+    ('a', 'b', 'c', 'd')
+    """
 
     names: tuple[str, ...] = ("1", "2", "3")
     p_body_marker: Floats = field(default_factory=tight.L_SHAPE.copy)
@@ -114,7 +162,14 @@ Hidden = Sequence[tuple[str, float, float]]
 
 
 def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: float = 0.25) -> Hidden:
-    """Occlusions that leave one marker visible at a time, each for `each_s` in turn, from `begin_s` on."""
+    """Occlusions that leave one marker visible at a time, each for `each_s` in turn, from `begin_s` on.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import marker_runs
+    >>> marker_runs.cyclic(("1", "2"), duration_s=2.0, begin_s=1.0, each_s=0.5)
+    [('2', 1.0, 1.5), ('1', 1.5, 2.0)]
+    """
     hidden = []
     count = int(np.ceil((duration_s - begin_s) / each_s))
     for i in range(count):
@@ -125,7 +180,16 @@ def cyclic(names: Sequence[str], duration_s: float, begin_s: float, each_s: floa
 
 
 class Unrecorded(NamedTuple):
-    """Ground truth at the IMU's times that no recording holds; each (N, 3)."""
+    """Ground truth at the IMU's times that no recording holds; each (N, 3).
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import marker_runs
+    >>> motion = marker_runs.sinusoidal_motion()
+    >>> run, truth = marker_runs.tool_run("tool", motion, seed=1, duration_s=2.0)
+    >>> truth.velocity.shape == truth.bias.shape == run.need_imu().gyroscope.shape
+    True
+    """
 
     velocity: Floats
     """m/s, reference frame."""
@@ -167,6 +231,15 @@ def tool_recording(
     start_ns
         Time of the first samples, ns; the first frame is taken then, and arrives and is stamped later by
         the latency.
+
+    Examples
+    --------
+    >>> from jaxekf.simulation import marker_runs
+    >>> motion = marker_runs.sinusoidal_motion()
+    >>> hidden = [("1", 0.5, 1.0)]
+    >>> run = marker_runs.tool_recording("tool", motion, seed=1, duration_s=2.0, hidden=hidden)
+    >>> list(run.streams), bool(run.markers.visible[:, 0].all()), bool(run.markers.visible[:, 1].all())
+    (['markers', 'imu', 'encoder'], False, True)
     """
     return tool_run(
         name,
@@ -191,7 +264,17 @@ def tool_run(
     hidden: Hidden = (),
     start_ns: int = 0,
 ) -> tuple[Recording, Unrecorded]:
-    """The same as `tool_recording`, with the ground truth that a recording does not hold."""
+    """The same as `tool_recording`, with the ground truth that a recording does not hold.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> motion = marker_runs.sinusoidal_motion()
+    >>> run, truth = marker_runs.tool_run("tool", motion, seed=1, duration_s=2.0)
+    >>> np.allclose(truth.velocity[0], motion.velocity(np.zeros(1)))
+    True
+    """
     grade, tool = grade or ToolGrade(), tool or Tool()
     rng = np.random.default_rng([seed, 6])
     taken = sample_times(1.0 / grade.tracker_s, duration_s, start_ns)
@@ -274,5 +357,14 @@ def _biased(
 
 
 def raw_yaw(q: Floats) -> Floats:
-    """Heading (N,) in radians of quaternions (N, 4)."""
+    """Heading (N,) in radians of quaternions (N, 4).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxekf.simulation import marker_runs
+    >>> quarter_turn_about_z = np.sqrt([[0.5, 0.0, 0.0, 0.5]])
+    >>> np.rad2deg(marker_runs.raw_yaw(quarter_turn_about_z)).round(6).tolist()
+    [90.0]
+    """
     return to_scipy(q).as_euler("ZYX")[:, 0]

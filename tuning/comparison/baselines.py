@@ -13,7 +13,8 @@ from jaxekf.estimation.parameters import leaves_by_name
 from jaxekf.filtering.model import Model, Parameters
 from jaxekf.recordings.types import Recording
 from tuning.comparison.allan_only import allan_only
-from tuning.parametrisation.free_vector import Layout, Leaf
+from tuning.parametrisation.free_vector import Layout
+from tuning.parametrisation.leaf import Leaf
 from tuning.persistence.fold_checkpoint import FoldCheckpoint, pack_found, unpack_found
 from tuning.results.fitted import FittedParameters
 from tuning.results.searched import Found, Searched

@@ -35,6 +35,16 @@ def compare(
     Comparison
         Its rows begin, for each run with a tracker, with `hold last`: the last tracker sample, and the
         gyroscope as rate. That has no covariance, so that NIS and NEES are NaN.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> params = jaxekf.get_model("loose").parameters
+    >>> variants = {"start": params, "triple noise": tuning.scaled(params, 9.0)}
+    >>> found = tuning.compare("loose", [jaxekf.demo.FOLDER / "free-5"], variants)
+    >>> [(row.variant, round(row.nis, 1)) for row in found.rows]
+    [('hold last', nan), ('start', 1.0), ('triple noise', 0.1)]
     """
     recordings = read(runs)
     estimates = {

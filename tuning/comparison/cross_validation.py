@@ -26,7 +26,14 @@ from tuning.tuner import fit_runs, tune
 
 
 class Limits(NamedTuple):
-    """Limits of the searches without gradients, as in the literature."""
+    """Limits of the searches without gradients, as in the literature.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> tuning.Limits(sweeps=5)  # for `tuning.cross_validate(..., limits=...)`
+    Limits(sweeps=5, evaluations=None)
+    """
 
     sweeps: int = 20
     """Sweeps of coordinate search."""
@@ -92,6 +99,20 @@ def cross_validate(
     TuningError
         For less than two folds, more folds than runs with an encoder, two runs of one name, files of
         another cross-validation, ``allan`` if no run rests, and as in `tune`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> found = tuning.cross_validate(runs, **problem)
+    >>> [fold.held_out for fold in found.folds]
+    [('free-1',), ('free-2',)]
+    >>> [(row.run, row.variant) for row in found.rows if row.variant == "tuned"]
+    [('free-1', 'tuned'), ('free-2', 'tuned')]
+    >>> tuning.BASELINES  # names for the argument `baselines`
+    ('allan', 'coordinates', 'nelder-mead')
     """
     recordings, validation = read(runs), read(validate)
     chosen = adapted(get_model(model), [*recordings, *validation])

@@ -33,14 +33,27 @@ class Truth(NamedTuple):
 
 
 class Data(NamedTuple):
-    """Several runs, padded to one length, on the first axis."""
+    """Several runs, padded to one length, on the first axis.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> data = tuning.prepare(jaxekf.get_model("loose"), jaxekf.demo.paths(("free-1", "free-2")))
+    >>> data.truth["attitude"].value.shape  # runs, epochs, substeps, w x y z
+    (2, 1536, 2, 4)
+    >>> data.place.tolist()
+    [0, 1]
+    """
 
     means: Any
     """Initial mean of each run."""
     setup: Any
     """`Parameters.setup` of each run."""
     steps: Steps
+    """Time steps and measurements, leading axes (runs, K, S)."""
     truth: dict[str, Truth]
+    """Truth of each output by its name; empty for a model without any of them."""
     counted: Any
     """(runs, K, S) instants past the burn-in, at which the likelihood counts."""
     place: Any
@@ -67,6 +80,17 @@ def prepare(
     ------
     TuningError
         Without any run, or if truth is needed and none is scored.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> model = jaxekf.get_model("loose")
+    >>> data = tuning.prepare(model, jaxekf.demo.paths(("free-1", "free-2")), burn_in_s=2.0)
+    >>> data.counted.shape  # runs, epochs, substeps
+    (2, 1536, 2)
+    >>> sorted(data.truth)
+    ['attitude', 'rate']
     """
     recordings, lines = _read(model, runs)
     data = _stack(model, recordings, lines, burn_in_s, range(len(lines)))

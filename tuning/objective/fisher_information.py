@@ -31,7 +31,18 @@ _Z95 = 1.959963984540054
 
 @dataclass(frozen=True)
 class Information:
-    """Fisher information of the free numbers of a layout, at one point."""
+    """Fisher information of the free numbers of a layout, at one point.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 5}
+    >>> known = tuning.tune(runs, **problem, confidence_intervals=True).information
+    >>> print(f"noise.optical is known to {100.0 * known.sigma()[0]:.0f} %")  # of a logarithm
+    noise.optical is known to 1 %
+    """
 
     layout: Layout
     free: Floats

@@ -31,6 +31,13 @@ class Objective:
     ``sum(weight * mean |error|^2) - likelihood * mean(log-likelihood of a measured row)``, and the
     weighted likelihood of the truth and prior. Attitude errors are geodesic angles in degrees, rate errors
     in deg/s, position errors in mm. Add two objectives to combine them.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> position = tuning.Objective(errors=(("position", 1.0),))
+    >>> (tuning.attitude_error() + 0.1 * position).describe()
+    '1 * mean squared attitude error + 0.1 * mean squared position error'
     """
 
     errors: tuple[tuple[str, float], ...] = ()
@@ -88,17 +95,38 @@ class Objective:
 
 
 def attitude_error() -> Objective:
-    """Mean squared geodesic angle to the encoder, deg^2."""
+    """Mean squared geodesic angle to the encoder, deg^2.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> (tuning.attitude_error() + 0.1 * tuning.innovation_likelihood()).describe()
+    '1 * mean squared attitude error + 0.1 * negative innovation log-likelihood'
+    """
     return Objective((("attitude", 1.0),))
 
 
 def rate_error() -> Objective:
-    """Mean squared rate error, (deg/s)^2."""
+    """Mean squared rate error, (deg/s)^2.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> (2.0 * tuning.rate_error()).describe(), tuning.rate_error().needs_truth
+    ('2 * mean squared rate error', True)
+    """
     return Objective((("rate", 1.0),))
 
 
 def innovation_likelihood() -> Objective:
-    """Negative log-likelihood of the innovations, per measured row; needs no truth."""
+    """Negative log-likelihood of the innovations, per measured row; needs no truth.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> tuning.innovation_likelihood().describe(), tuning.innovation_likelihood().needs_truth
+    ('1 * negative innovation log-likelihood', False)
+    """
     return Objective(likelihood=1.0)
 
 
@@ -188,6 +216,17 @@ def evaluate(
     counts
         If `data` is one group of several, those of `count` over all groups: the values of the groups
         then add up to that of all.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> model, aim = jaxekf.get_model("loose"), tuning.innovation_likelihood()
+    >>> data = tuning.prepare(model, jaxekf.demo.paths(("free-1", "free-2")))
+    >>> value = jaxekf.jit(lambda params: tuning.evaluate(model, aim, params, data))
+    >>> small, large = (tuning.scaled(model.parameters, factor) for factor in (0.1, 10.0))
+    >>> bool(value(model.parameters) < min(value(small), value(large)))
+    True
     """
     require_float64()
     params = arguments.parameters(model, params, check_shapes=False)

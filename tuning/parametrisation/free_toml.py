@@ -27,6 +27,18 @@ def read_free(path: Path | str) -> list[Free]:
     ------
     TuningError
         For a file that has anything else.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "free.toml"  # the same as a table [[free]] with two lines
+    ...     _ = file.write_text('free = [{name = "calibration.clock_offset", bounds = [-0.1, 0.1]}]')
+    ...     [entry] = tuning.read_free(file)
+    >>> entry.name, entry.bounds
+    ('calibration.clock_offset', (-0.1, 0.1))
     """
     try:
         document = tomllib.loads(Path(path).read_text("utf-8-sig"))

@@ -18,17 +18,14 @@ from jaxekf._support.errors import TuningError
 from jaxekf.estimation.parameters import as_arrays, for_model, leaf_names, leaves_by_name
 from jaxekf.filtering import arguments
 from jaxekf.filtering.model import Model, Parameters
-from jaxekf.recordings.types import Floats
+from tuning.parametrisation.leaf import WEAK_LOG, Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS, no_correction
 
 # A step of one in the free vector changes a leaf of calibration or truth by this much, by its unit.
 _NATURAL_STEP = {"s": 0.005, "1": 0.01, "rad": 0.01, "m": 0.01, "s/s": 1e-5}
-# Standard deviations of weak priors: of a logarithm (a factor of ten), and by unit.
-_WEAK_LOG = 2.3
+# Standard deviations of weak priors by unit.
 _WEAK = {"s": 0.05, "1": 0.05, "rad": 0.1, "m": 0.05, "s/s": 2e-4}
 AXES = ("tied", "each", "full")
-# Nearer to a bound, as a share of the half width, a number does not come.
-_INSIDE = 1.0 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -54,117 +51,17 @@ class Free:
 
 
 @dataclass(frozen=True)
-class Leaf:
-    """One free leaf: its name, its shape, and its parametrisation."""
-
-    name: str
-    shape: tuple[int, ...]
-    """Shape of one run's value."""
-    kind: str
-    """`log`, `factor` or `linear`."""
-    step: float = 1.0
-    runs: int = 0
-    """Number of runs that each have their own value; 0 if all share one."""
-    prior: float = _WEAK_LOG
-    """Standard deviation of a free number about its start."""
-    bounds: tuple[float, float] | None = None
-    """Bounds of the free number before `_bend`."""
-    middle: tuple[float, ...] = ()
-    """With bounds: initial free numbers of one run, at which `_bend` changes nothing."""
-
-    @property
-    def each(self) -> int:
-        """Free numbers of one run's value."""
-        if self.kind == "factor":
-            return self.shape[0] * (self.shape[0] + 1) // 2
-        return int(np.prod(self.shape, dtype=int))
-
-    @property
-    def size(self) -> int:
-        """Free numbers."""
-        return self.each * max(self.runs, 1)
-
-    def to_free(self, value: Array) -> Array:
-        """Free numbers of a value, with `runs` on its first axis or not."""
-        if not self.runs:
-            return self._free(value)
-        own = jnp.ndim(value) > len(self.shape)
-        every = value if own else jnp.broadcast_to(value, (self.runs, *self.shape))
-        return jax.vmap(self._free)(every).reshape(-1)
-
-    def from_free(self, free: Array) -> Array:
-        """Value of free numbers, with the runs on the first axis if each has its own."""
-        if not self.runs:
-            return self._value(free)
-        return jax.vmap(self._value)(free.reshape(self.runs, self.each))
-
-    def is_logarithm(self, number: int) -> bool:
-        """Whether one of its free numbers is a logarithm."""
-        diagonal = self.kind == "factor" and number % self.each < self.shape[0]
-        return self.kind == "log" or diagonal
-
-    def unbounded(self, free: float, number: int) -> float:
-        """One of its free numbers as it is between its bounds."""
-        if self.bounds is None:
-            return float(free)
-        middle = np.asarray(self.middle[number % self.each])
-        return float(_bend(jnp.asarray(free), self.bounds, middle))
-
-    def _free(self, value: Array) -> Array:
-        return _unbend(self._straight(value), self.bounds, np.asarray(self.middle))
-
-    def _straight(self, value: Array) -> Array:
-        if self.kind == "log":
-            return jnp.log(value).reshape(-1)
-        if self.kind == "factor":
-            logs = jnp.log(jnp.diagonal(value))
-            rows, columns = np.tril_indices(self.shape[0], -1)
-            return jnp.concatenate([logs, value[rows, columns] / value[rows, rows]])
-        return (value / self.step).reshape(-1)
-
-    def _value(self, free: Array) -> Array:
-        free = _bend(free, self.bounds, np.asarray(self.middle))
-        if self.kind == "log":
-            return jnp.exp(free).reshape(self.shape)
-        if self.kind == "factor":
-            size = self.shape[0]
-            diagonal = jnp.exp(free[:size])
-            rows, columns = np.tril_indices(size, -1)
-            below = free[size:] * diagonal[rows]
-            return jnp.diag(diagonal).at[rows, columns].set(below)
-        return free.reshape(self.shape) * self.step
-
-
-def _bend(free: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
-    """Map any number to one between the bounds. The start is mapped to itself with a slope of one, so that
-    steps, priors and intervals mean the same with bounds as without."""
-    if bounds is None:
-        return free
-    middle, half, at, reach = _curve(bounds, start)
-    return middle + half * jnp.tanh(at + (free - start) / reach)
-
-
-def _unbend(bent: Array, bounds: tuple[float, float] | None, start: Floats) -> Array:
-    if bounds is None:
-        return bent
-    begin = jnp.asarray(start)
-    middle, half, at, reach = _curve(bounds, start)
-    # Covariances that are scaled to the errors may leave the bounds; then the nearest point is taken.
-    inside = jnp.clip((bent - middle) / half, -_INSIDE, _INSIDE)
-    return begin + reach * (jnp.arctanh(inside) - at)
-
-
-def _curve(bounds: tuple[float, float], start: Floats) -> tuple[float, float, Floats, Floats]:
-    """Middle and half width of the interval between the bounds, position of the start on the curve, and the
-    free distance that is one there."""
-    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
-    share = np.clip((start - middle) / half, -_INSIDE, _INSIDE)
-    return middle, half, np.arctanh(share), half * (1.0 - share**2)
-
-
-@dataclass(frozen=True)
 class Layout:
-    """Which leaves are free, in the order of the free vector. Hashable, so that it can be static."""
+    """Which leaves are free, in the order of the free vector. Hashable, so that it can be static.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> model = jaxekf.get_model("loose")
+    >>> free = tuning.layout(model, model.parameters, ["noise.optical", "calibration.clock_offset"])
+    >>> free.labels(), free.is_logarithm.tolist()
+    (['noise.optical', 'calibration.clock_offset'], [True, False])
+    """
 
     leaves: tuple[Leaf, ...]
 
@@ -302,6 +199,14 @@ def layout(
     whole section, or `Free`; the last entry of a name counts. `runs` is the number of runs that may have
     parameters of their own. Raises `TuningError` for an unknown name, a start outside its domain or
     bounds, and an invalid prior or bounds.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> model = jaxekf.get_model("loose")
+    >>> offset = tuning.Free("calibration.clock_offset", each_run=True)
+    >>> tuning.layout(model, model.parameters, [offset], runs=2).labels()
+    ['calibration.clock_offset of run 0', 'calibration.clock_offset of run 1']
     """
     params = arguments.parameters(model, params, check_shapes=False)
     values = leaves_by_name(params)
@@ -337,7 +242,7 @@ def _leaf(name: str, value: Any, unit: str, entry: Free, runs: int) -> Leaf:
     kind = "linear" if linear else "factor" if value.ndim == 2 else "log"
     prior = entry.prior
     if prior is None:
-        prior = _WEAK.get(unit, step) if linear else _WEAK_LOG
+        prior = _WEAK.get(unit, step) if linear else WEAK_LOG
     if not 0.0 < prior < np.inf:
         raise TuningError(
             f"got a prior of {prior} for {name}, expected a positive standard deviation; leave it out"
@@ -387,6 +292,14 @@ def with_axes(
     """Noise with one deviation for all axes (`tied`), one for `each`, or a `full` factor.
 
     With `free` (see `layout`) only the leaves that it names are changed.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> model = jaxekf.get_model("loose")
+    >>> params = tuning.with_axes(model, model.parameters, "full", ["noise.optical"])
+    >>> params.noise.optical.shape, params.noise.gyroscope.shape
+    ((3, 3), ())
     """
     if axes not in AXES:
         raise TuningError(f"got axes '{axes}', expected one of {AXES}; choose one")
@@ -430,7 +343,15 @@ SCALED = ("noise.", "initial.")
 
 
 def scaled(params: Parameters, factor: float) -> Parameters:
-    """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales."""
+    """All covariances (Q, R and P0) times `factor`: the estimate stays, its uncertainty scales.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> params = jaxekf.get_model("loose").parameters
+    >>> float(tuning.scaled(params, 4.0).noise.optical / params.noise.optical)  # of a deviation
+    2.0
+    """
     root = np.sqrt(factor)
     return params._replace(
         noise=jax.tree.map(lambda a: a * root, arguments.float_leaves("noise", params.noise)),

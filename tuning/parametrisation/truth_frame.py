@@ -13,7 +13,20 @@ from jaxekf.geometry import rotation
 
 
 class TruthFrame(NamedTuple):
-    """Corrections of an encoder; zero changes nothing."""
+    """Corrections of an encoder; zero changes nothing.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> encoder = run.need_encoder()
+    >>> late = run.replace(encoder=replace(encoder, time_ns=encoder.time_ns + 5_000_000))
+    >>> problem = {"objective": "attitude", "free": ["truth.clock_offset"], "iterations": 5}
+    >>> print(f"{1e3 * tuning.tune([late], **problem).truth.clock_offset:.1f} ms")
+    5.0 ms
+    """
 
     clock_offset: Any
     """Seconds to add to the timeline's time to get the encoder's, within some 20 ms; ()."""

@@ -66,7 +66,20 @@ def fold_file(file: Path | str | None, number: int) -> Path | None:
 
 
 def forget_folds(checkpoint: Path | str) -> None:
-    """Remove the checkpoints of folds that `cross_validate` has written."""
+    """Remove the checkpoints of folds that `cross_validate` has written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "state"  # the `checkpoint` of `cross_validate`
+    ...     file.with_name("state.fold1").touch()
+    ...     tuning.forget_folds(file)
+    ...     print(list(Path(folder).iterdir()))
+    []
+    """
     number = 1
     while (path := fold_file(checkpoint, number)) is not None and path.exists():
         path.unlink()

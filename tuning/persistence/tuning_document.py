@@ -12,7 +12,8 @@ from jaxekf.io.documents import codec
 from jaxekf.io.documents.tuning import TuningDocument
 from jaxekf.io.run_folder import SCHEMA_VERSION
 from tuning.objective.fisher_information import interval
-from tuning.parametrisation.free_vector import SCALED, Leaf
+from tuning.parametrisation.free_vector import SCALED
+from tuning.parametrisation.leaf import Leaf
 from tuning.parametrisation.truth_frame import TRUTH_UNITS
 from tuning.persistence._tuning_warnings import cautions
 from tuning.results.comparison import Row, as_dicts
@@ -120,6 +121,19 @@ def save_record(
         If `judged_on` contradicts the names of the runs.
     RecordingError
         If a folder has the name of the file.
+
+    Examples
+    --------
+    >>> import json, tempfile
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=2)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = tuning.save_record(folder, tuned)
+    ...     document = json.loads(file.read_text("utf-8"))
+    >>> file.name, document["runs"], document["numbers"][0]["label"]
+    ('tuning.json', ['free-1'], 'noise.optical')
     """
     return write_record(folder, record(tuned, rows=rows, judged_on=judged_on, folds=folds))
 

@@ -39,6 +39,19 @@ def save(
     ------
     TuningError
         If `judged_on` contradicts the names of the runs; then nothing is written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=2)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     tuning.save(tuned, folder)
+    ...     again = jaxekf.load_parameters(tuned.model, folder)
+    >>> bool(again.noise.optical == tuned.params.noise.optical)
+    True
     """
     document = record(tuned, rows=rows, judged_on=judged_on, folds=folds)
     origin = tuned.origin | {"tuning": tuned.digest}

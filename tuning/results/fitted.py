@@ -7,7 +7,19 @@ from tuning.parametrisation.free_vector import Layout
 
 
 class Fitted(Protocol):
-    """Anything with parameters for further runs, such as `Tuned` and `Searched`."""
+    """Anything with parameters for further runs, such as `Tuned` and `Searched`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"]}
+    >>> fitted = [tuning.tune(runs, **problem, iterations=5)]
+    >>> fitted.append(tuning.tune_by_coordinates(runs, **problem, sweeps=2))
+    >>> [sorted(tuning.fit_runs([jaxekf.demo.FOLDER / "free-5"], one)) for one in fitted]
+    [['free-5'], ['free-5']]
+    """
 
     @property
     def model(self) -> Model:

@@ -21,7 +21,14 @@ COLUMNS = tuple(name for name in Row._fields if name not in ("run", "variant"))
 
 
 class Work(NamedTuple):
-    """Number of filterings of all training runs."""
+    """Number of filterings of all training runs.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> tuning.Work(filterings=5.0, gradients=10.0).forward(gradient_cost=3.0)
+    35.0
+    """
 
     filterings: float
     """Filterings without a gradient: values, Fisher information (two for each number and one), the scale,
@@ -42,7 +49,18 @@ def work_of(fitted: Fitted) -> Work:
 
 
 class Fold(NamedTuple):
-    """One tuning, and the runs that it did not learn from."""
+    """One tuning, and the runs that it did not learn from.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> first = tuning.cross_validate(runs, **problem).folds[0]
+    >>> first.held_out, first.tuned.origin["runs"], first.work["tuned"].gradients
+    (('free-1',), ['free-2'], 2.0)
+    """
 
     held_out: tuple[str, ...]
     """Names of runs."""
@@ -64,7 +82,18 @@ class Fold(NamedTuple):
 
 
 class ParameterSpread(NamedTuple):
-    """Values of one parameter over the folds, in its unit."""
+    """Values of one parameter over the folds, in its unit.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> optical = tuning.cross_validate(runs, **problem).parameters["noise.optical"]
+    >>> optical.each.shape, f"{optical.mean:.4f} rad", bool(optical.deviation < 0.1 * optical.mean)
+    ((2,), '0.0054 rad', True)
+    """
 
     start: Floats
     """In the parameter's shape."""
@@ -78,7 +107,18 @@ class ParameterSpread(NamedTuple):
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Result of `tuning.cross_validate`."""
+    """Result of `tuning.cross_validate`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> found = tuning.cross_validate(runs, **problem)
+    >>> {name: round(spread.mean, 2) for name, spread in found.spread("attitude_rmse_deg").items()}
+    {'hold last': 8.38, 'start': 0.1, 'tuned': 0.1}
+    """
 
     rows: list[Row]
     """Rows of each held-out run in the order given: `hold last`, `start`, and its fold's baselines and

@@ -30,7 +30,20 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Searched:
-    """Result of a tuning without gradients."""
+    """Result of a tuning without gradients.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"]}
+    >>> found = tuning.tune_by_nelder_mead(runs, **problem, evaluations=8)
+    >>> found.history[0].evaluations, found.history[-1].value == found.value
+    (1, True)
+    >>> found.evaluations, found.filterings
+    (8, 8)
+    """
 
     model: Model
     params: Parameters

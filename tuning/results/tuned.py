@@ -22,10 +22,23 @@ from tuning.parametrisation.truth_frame import TruthFrame
 
 
 class Iteration(NamedTuple):
-    """One step of the tuner."""
+    """One step of the tuner.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=5)
+    >>> first = tuned.history[0]
+    >>> first.number, first.rejected, tuned.best.training < first.training
+    (0, False, True)
+    """
 
     number: int
+    """Number of the step, the start being 0."""
     training: float
+    """Objective of the training runs, in its own unit."""
     validation: float
     """NaN without validation runs."""
     rejected: bool
@@ -36,7 +49,18 @@ Progress = Callable[[Iteration, int], None]
 
 
 class Outcome(NamedTuple):
-    """Result of one start of several."""
+    """Result of one start of several.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
+    >>> tuned = tuning.tune(runs, **problem, optimiser=tuning.FisherScoring(), starts=2)
+    >>> [(outcome.iterations, outcome.ending) for outcome in tuned.starts]
+    [(2, 'the 2 iterations asked for are done'), (2, 'the 2 iterations asked for are done')]
+    """
 
     value: float
     """Lowest objective, of the validation runs if there are any; infinite if it could not begin."""
@@ -47,20 +71,36 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class Tuned:
-    """Result of `tuning.tune`."""
+    """Result of `tuning.tune`.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1", "free-2"))
+    >>> tuned = tuning.tune(runs, objective="likelihood", free=["noise.optical"], iterations=5)
+    >>> tuned.moved, tuned.rejections, sorted(tuned.inputs)
+    (['x 1.01'], 0, ['free-1', 'free-2'])
+    >>> tuned.origin["free"], tuned.scale
+    (['noise.optical'], 1.0)
+    """
 
     model: Model
     params: Parameters
     """Best parameters, by validation if there is one; the mean over the runs where each run has its own."""
     start: Parameters
+    """Initial parameters, in the shapes that were tuned."""
     objective: Objective
     best: Iteration
+    """Iteration whose parameters were chosen."""
     history: tuple[Iteration, ...]
+    """All iterations, in order."""
     stopped: str
     """Reason for the end of the search, in words."""
     scale: float
     """Factor on all covariances after the fit, so that the errors match them."""
     layout: Layout
+    """Free parameters, and their order in `free`."""
     origin: dict[str, Any] = field(default_factory=dict)
     each: dict[str, Parameters] = field(default_factory=dict)
     """Parameters of each training run by its name, if runs have parameters of their own."""

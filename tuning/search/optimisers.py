@@ -25,7 +25,18 @@ class Optimiser(Protocol):
 
 @dataclass(frozen=True)
 class LBFGS:
-    """L-BFGS with backtracking, for any objective."""
+    """L-BFGS with backtracking, for any objective.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 20}
+    >>> tuned = tuning.tune(runs, **problem, optimiser=tuning.LBFGS())  # the default
+    >>> tuned.stopped, tuned.filterings
+    ('converged', 0.0)
+    """
 
     def search(self, *problem: Any, starts: int, seed: int) -> Descent:
         """See `Optimiser`."""
@@ -37,6 +48,18 @@ class FisherScoring:
     """Fisher scoring, for likelihood and `map` with up to about thirty free numbers.
 
     It takes few steps and compiles no gradient; each step filters all runs twice for each number.
+
+    Examples
+    --------
+    >>> import jaxekf, tuning
+    >>> jaxekf.set_up()
+    >>> runs = jaxekf.demo.paths(("free-1",))
+    >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 5}
+    >>> tuned = tuning.tune(runs, **problem, optimiser=tuning.FisherScoring())
+    >>> tuned.evaluations  # with a gradient
+    0
+    >>> print(f"{tuned.params.noise.optical:.4f} rad")
+    0.0053 rad
     """
 
     def search(self, *problem: Any, starts: int, seed: int) -> Descent:
@@ -52,7 +75,15 @@ class FisherScoring:
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam on minibatches, for very many runs; an iteration is a pass over all of them."""
+    """Adam on minibatches, for very many runs; an iteration is a pass over all of them.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> optimiser = tuning.Adam(batch=4)  # for `tuning.tune(runs, optimiser=optimiser)`
+    >>> optimiser.batch
+    4
+    """
 
     batch: int = 16
     """Number of runs of a step."""

@@ -56,6 +56,16 @@ def available_figures(estimate: Estimate, recording: Recording) -> tuple[str, ..
     -------
     tuple of str
         Names in `figure_functions`, in alphabetical order.
+
+    Examples
+    --------
+    >>> import jaxekf
+    >>> from jaxekf.reporting import plots
+    >>> jaxekf.set_up()
+    >>> run = jaxekf.load(jaxekf.demo.FOLDER / "free-5")
+    >>> names = plots.available_figures(jaxekf.estimate(run), run)
+    >>> "attitude" in names, "position" in names  # the model has no position
+    (True, False)
     """
     if len(estimate.time_ns) < _FEWEST_INSTANTS:
         return ()

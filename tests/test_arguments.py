@@ -139,6 +139,8 @@ def test_a_wrong_shape_is_refused_where_it_is_given():
         replace(RUN.optical, q_ref_body=np.zeros((10, 3)))
     with pytest.raises(jaxekf.RecordingError, match=r"imu:gyroscope: .*shape \(N, 3\)"):
         jaxekf.Imu(np.arange(5), np.zeros(5))
+    with pytest.raises(jaxekf.RecordingError, match="imu:gyroscope: got None, expected a value"):
+        replace(RUN.imu, gyroscope=None)
     with pytest.raises(jaxekf.RecordingError, match=r"optical:latency_ns: .*a whole number"):
         replace(RUN.optical, latency_ns=1.5e6)
     assert type(replace(RUN.optical, latency_ns=np.int32(5)).latency_ns) is int

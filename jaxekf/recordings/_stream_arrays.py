@@ -26,11 +26,13 @@ def convert(stream: Any, label: str, shapes: Mapping[str, Shape]) -> None:
     Raises `RecordingError`, which names label and field, for a field that cannot be converted exactly or
     has not the shape in `shapes`.
     """
-    for name, kind in _kinds(type(stream)):
+    for name, kind, is_optional in _kinds(type(stream)):
         value = getattr(stream, name)
-        if value is None:
+        if value is None and is_optional:
             continue
         refuse = partial(RecordingError, label, column=name)
+        if value is None:
+            raise refuse("None", "a value for each sample", "leaving out the stream")
         if kind in _ARRAYS:
             found = _ARRAYS[kind](value, refuse, shapes.get(name))
         elif kind in _NUMBERS:
@@ -42,12 +44,15 @@ def convert(stream: Any, label: str, shapes: Mapping[str, Shape]) -> None:
 
 
 @cache
-def _kinds(cls: type) -> tuple[tuple[str, Any], ...]:
-    """Name and type, without ``| None``, of the fields that are converted."""
+def _kinds(cls: type) -> tuple[tuple[str, Any, bool], ...]:
+    """Name and type of the fields that are converted, and whether they may be None."""
     known = {tuple[str, ...], *_ARRAYS, *_NUMBERS}
     stated = ((f.name, f.type, get_args(f.type)) for f in fields(cls))
-    every = ((name, args[0] if type(None) in args else kind) for name, kind, args in stated)
-    return tuple((name, kind) for name, kind in every if kind in known)
+    every = [
+        (name, args[0] if type(None) in args else kind, type(None) in args)
+        for name, kind, args in stated
+    ]
+    return tuple(one for one in every if one[1] in known)
 
 
 def _words(value: Any, refuse: Refuse) -> tuple[str, ...]:

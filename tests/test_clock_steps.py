@@ -66,6 +66,9 @@ def test_a_step_of_the_trackers_clock_is_named(size):
     assert found.since_s == pytest.approx(17.0, abs=0.05)
     with pytest.raises(RecordingError, match="step of the tracker's clock by"):
         align(stepped.optical, stepped.imu)
+    seen = inspect(stepped)
+    assert seen.evidence.clock_steps and np.isnan(seen.evidence.rate_ratio)
+    assert "step of the tracker's clock" in " ".join(seen.warnings)
 
 
 def test_a_step_of_the_imus_clock_is_named():

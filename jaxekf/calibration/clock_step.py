@@ -45,6 +45,10 @@ _SIZE_OFF, _NEAR_S = 0.2, 2.0
 """Relative error of a gap that is the step, and seconds from the step."""
 
 
+class ClockStepError(RecordingError):
+    """A run whose clocks step against each other, so that it has no one latency."""
+
+
 class ClockStep(NamedTuple):
     """A step of the tracker's clock against the IMU's."""
 
@@ -62,7 +66,7 @@ class ClockStep(NamedTuple):
     def error(self, place: object) -> RecordingError:
         """The error of a run that cannot have one clock offset."""
         gained = " and ".join(f"{100.0 * share:.0f} %" for share in self.explained)
-        return RecordingError(
+        return ClockStepError(
             str(place),
             f"{self.sentence()} (the gyroscope explains {gained} of the rotation without and with it)",
             "clocks that do not step",

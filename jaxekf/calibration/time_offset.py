@@ -33,7 +33,8 @@ _COARSE = 6000
 """Relative rotations that the coarse search uses."""
 _OUTLIER_RATIO = 5.0
 """Residuals larger than the median by this factor are outliers."""
-_ROUNDS = 12
+_ROUNDS, _CONVERGED = 12, 1e-6
+"""Most iterations, and the step, rad and s, that ends them."""
 _CORRELATED = 8
 """Samples over which residuals are taken to be correlated."""
 _LARGEST_SIGMA_S = 0.005
@@ -241,6 +242,8 @@ def _gauss_newton(turns: _Rotations, integral: GyroscopeIntegral, latency: float
         latency = float(np.clip(latency + np.clip(solution[6], -0.02, 0.02), -1.0, 1.0))
         size = np.linalg.norm(residual, axis=1)
         kept = size <= _OUTLIER_RATIO * max(float(np.median(size)), 1e-12)
+        if np.max(np.abs(solution[[0, 1, 2, 6]])) < _CONVERGED:
+            break
     sigma = np.sqrt(np.diagonal(_robust_covariance(design, residual, kept)))
     return Match(
         latency,

@@ -3,7 +3,7 @@
 `inspect` gathers the findings for `jaxekf check`; its verdict is ``fine``, ``warnings`` or ``faults``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from jaxekf.calibration.alignment import (
     misalignment_deg,
     unobservable_turn,
 )
-from jaxekf.calibration.clock_step import common_jump
+from jaxekf.calibration.clock_step import ClockStepError, common_jump
 from jaxekf.checks._camera_agreement import (
     CameraEvidence,
     camera_evidence,
@@ -144,6 +144,8 @@ def inspect(recording: Recording) -> Inspection:
             aligned = align_run(recording)
         except RecordingError as error:
             warnings.append(f"clock and frame could not be estimated: {error}")
+            if isinstance(error, ClockStepError):
+                found = replace(found, clock_steps=True, rate_ratio=np.nan, explained=np.nan)
     if aligned is not None and (turn := unobservable_turn(aligned.tracker.alignment_cov)):
         notes.append(turn)
     for label in streams:

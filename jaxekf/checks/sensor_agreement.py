@@ -43,6 +43,8 @@ class Evidence:
     1."""
     lag_s: float = np.nan
     """Lag of the tracker to 5 ms, s; `jaxekf.calibration.alignment` estimates it precisely."""
+    clock_steps: bool = False
+    """Whether a clock steps, so that rates and rotations of the whole run cannot be compared."""
     searched_s: float = np.nan
     """Largest clock offset, s, up to which no offset fits; NaN if one fits, 0 for too little rotation."""
     rate_ratio: float = np.nan
@@ -87,6 +89,7 @@ class Evidence:
             "rate_deg_s": self.rate * DEGREES,
             "second_axis": self.second_axis,
             "lag_s": self.lag_s,
+            "clock_steps": self.clock_steps,
             "searched_s": self.searched_s,
             "rate_ratio": self.rate_ratio,
             "rate_correlation": self.rate_correlation,

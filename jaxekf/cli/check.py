@@ -220,6 +220,8 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
             f"rate: the gyroscope turns {found.rate_ratio:.3f} times as fast as the {tracker} (correlation"
             f" {found.rate_correlation:.2f})"
         )
+    elif found.clock_steps:
+        lines.append("rate: not compared, since a clock steps")
     elif found.too_fast:
         lines.append(
             f"rate: about half a turn or more between the {tracker}'s samples: too fast for its rate to"
@@ -232,7 +234,7 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
         )
     elif found.turns:
         lines.append("rate: too little turning to determine the gyroscope's unit")
-    if found.readings and tracker == "tracker":
+    if found.readings and tracker == "tracker" and not found.clock_steps:
         others = max(made.explained for made in found.readings.values())
         lines.append(
             f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"

@@ -12,16 +12,16 @@ frame ``A_c`` is removed with the mean of each stretch. Residuals may be correla
 with a tracker that filters or a noisy gyroscope: the covariance is cluster-robust, one cluster a stretch.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxekf._support.errors import RecordingError
+from jaxekf.calibration._gyroscope_integral import GyroscopeIntegral, RotationsAt
 from jaxekf.calibration.time_offset import Match
-from jaxekf.geometry.host_rotation import running_product
 from jaxekf.recordings.accounts import Indices
-from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, from_scipy, to_scipy
+from jaxekf.recordings.types import NANOSECONDS, Flags, Floats, Imu, Optical, to_scipy
 
 _STRETCH_S = 2.0
 _FEWEST_STRETCHES = 20
@@ -37,6 +37,8 @@ _CONVERGED = 0.01
 _LEAST_DRIFT_S = 20.0
 _EXPLAINED, _KEPT = 0.8, 0.8
 _LARGEST_DRIFT = 1e-3
+_UNKNOWN, _NOTHING = 0.15, 10.0
+"""Standard deviation, rad, from which on an alignment about an axis is unobservable, and its value then."""
 _PRIOR = np.array([1.0, 1.0, 1.0, 0.2, 0.2, 0.2, 0.1, 1e-3])
 """Prior standard deviations of alignment (rad), bias (rad/s), latency (s) and drift, wide enough to matter
 only for unobservable parameters."""
@@ -52,7 +54,7 @@ class AttitudeMatch(NamedTuple):
     """Growth of the latency, s/s; NaN if the run is too short to estimate it."""
     drift_sigma: float
     alignment: Floats
-    """(3,) rotation vector, rad, tool frame to IMU frame."""
+    """(3,) rotation vector, rad, tool frame to IMU frame; without a turn about an unobservable axis."""
     alignment_cov: Floats
     """(3, 3) rad^2, of a small rotation in the tool frame, applied before the alignment."""
     bias: Floats
@@ -62,6 +64,47 @@ class AttitudeMatch(NamedTuple):
     middle_s: float
     """Seconds from the IMU's first sample to the middle of the run."""
     duration_s: float
+
+
+def unobservable_axis(alignment_cov: Floats) -> Floats | None:
+    """The axis, tool frame, about which the motion does not determine the alignment; None without one.
+
+    Parameters
+    ----------
+    alignment_cov
+        (3, 3) rad^2, of a small rotation in the tool frame.
+    """
+    values, axes = np.linalg.eigh(alignment_cov)
+    if not values[2] > _UNKNOWN**2 or values[1] > _UNKNOWN**2:
+        return None
+    axis = axes[:, 2]
+    return axis * np.sign(axis[np.argmax(np.abs(axis))])
+
+
+def without_turn(frame: Rotation, axis: Floats, reference: Rotation | None = None) -> Rotation:
+    """The rotation turned about an axis before it so as to be nearest to another one, or to none.
+
+    Parameters
+    ----------
+    frame
+        Tool frame to IMU frame.
+    axis
+        (3,) unit vector, tool frame.
+    reference
+        The rotation to come near to; identity without it.
+    """
+    x, y, z, w = (frame if reference is None else reference.inv() * frame).as_quat()
+    turn = 2.0 * np.arctan2(axis @ np.array([x, y, z]), w)
+    return frame * Rotation.from_rotvec(-turn * axis)
+
+
+def _observable(frame: Rotation, cov: Floats) -> tuple[Rotation, Floats]:
+    """Alignment without a turn about an unobservable axis, and its covariance with no knowledge of it."""
+    axis = unobservable_axis(cov)
+    if axis is None:
+        return frame, cov
+    rest = np.eye(3) - np.outer(axis, axis)
+    return without_turn(frame, axis), rest @ cov @ rest + _NOTHING**2 * np.outer(axis, axis)
 
 
 class _Stretches(NamedTuple):
@@ -125,17 +168,17 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
     free = slice(0, 8 if duration >= _LEAST_DRIFT_S else 7)
     frame, bias = Rotation.from_rotvec(start.alignment), start.bias
     clock = np.array([start.latency_s, 0.0])
+    tracked = stretches.q.as_matrix()
     kept, elapsed = np.ones(len(stretches.t), bool), stretches.t - middle
     solution = _Solution(np.zeros(8), np.eye(8), np.zeros((len(stretches.t), 3)), 0.0)
     for _ in range(_ROUNDS):
         at = stretches.t - clock[0] - clock[1] * elapsed
-        columns, off = _linearise(
-            stretches, _integrate(known, imu.gyroscope - bias, at), frame, kept
-        )
+        integral = GyroscopeIntegral(known, imu.gyroscope - bias)
+        columns, off = _linearise(stretches, integral.at(at), frame, kept)
         columns = np.concatenate([columns, columns[:, :, 6:] * elapsed[:, None, None]], axis=2)
         columns = stretches.remove_mean(columns[:, :, free], kept)
-        solution = _solve(stretches, columns, off, kept)
-        frame = frame * Rotation.from_rotvec(solution.step[:3])
+        solution = _solve(stretches, columns, tracked, off, kept)
+        frame = frame * Rotation.from_rotvec(np.clip(solution.step[:3], -0.5, 0.5))
         bias = bias + solution.step[3:6]
         clock = clock + np.clip(solution.step[6:], -0.05, 0.05)
         size = np.linalg.norm(solution.residual, axis=1)
@@ -151,6 +194,7 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
             "streams of one body, with clocks that do not jump",
         )
     sigma = np.sqrt(np.diagonal(solution.cov))
+    frame, alignment_cov = _observable(frame, solution.cov[:3, :3])
     drifting = duration >= _LEAST_DRIFT_S
     return AttitudeMatch(
         float(clock[0]),
@@ -158,7 +202,7 @@ def refine(optical: Optical, imu: Imu, start: Match, place: object = "recording"
         float(clock[1]) if drifting else np.nan,
         float(sigma[7]) if drifting else np.nan,
         frame.as_rotvec(),
-        solution.cov[:3, :3],
+        alignment_cov,
         bias,
         solution.scatter,
         middle,
@@ -171,7 +215,10 @@ def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _
     known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
     t = (optical.time_ns - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS
     inside = (t - latency_s >= known[0] + _SPARE_S) & (t - latency_s <= known[-1] - _SPARE_S)
-    rows = np.flatnonzero(optical.valid & inside)
+    at = np.clip(np.searchsorted(known, t - latency_s), 1, len(known) - 1)
+    step = np.diff(known)
+    longest = max(_LONGEST_IMU_GAP_S, 3.0 * float(np.median(step)))
+    rows = np.flatnonzero(optical.valid & inside & (step[at - 1] <= longest))
     span = float(np.ptp(t[rows])) if rows.size else 0.0
     length = float(np.clip(span / _FEWEST_STRETCHES, _SHORTEST_S, _STRETCH_S))
     # A gap of the IMU ends a stretch.
@@ -191,35 +238,8 @@ def _stretches(optical: Optical, imu: Imu, latency_s: float, place: object) -> _
     return _Stretches(t[rows], to_scipy(optical.q_ref_body[rows]), begin)
 
 
-class _GyroscopeIntegral(NamedTuple):
-    """Integral of the gyroscope's rate at some times."""
-
-    q: Rotation
-    """IMU frame to a fixed frame that may be any."""
-    rate: Floats
-    """(N, 3) rad/s."""
-    q_integral: Floats
-    """(N, 3, 3) s: integral over time of `q` as a matrix, the derivative by a bias."""
-
-
-def _integrate(known: Floats, rate: Floats, at: Floats) -> _GyroscopeIntegral:
-    """Integrate rates that are linear between samples; each step rotates by their mean."""
-    step = np.diff(known)
-    steps = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * step[:, None])
-    turn = to_scipy(running_product(from_scipy(steps)))
-    matrix = turn.as_matrix()
-    slabs = 0.5 * (matrix[1:] + matrix[:-1]) * step[:, None, None]
-    q_integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(slabs, axis=0)])
-    low: Any = np.clip(np.searchsorted(known, at, side="right") - 1, 0, len(step) - 1)
-    since = (at - known[low])[:, None]
-    slope = (rate[low + 1] - rate[low]) / step[low, None]
-    q = turn[low] * Rotation.from_rotvec((rate[low] + 0.5 * slope * since) * since)
-    half = 0.5 * (matrix[low] + q.as_matrix()) * since[:, :, None]
-    return _GyroscopeIntegral(q, rate[low] + slope * since, q_integral[low] + half)
-
-
 def _linearise(
-    stretches: _Stretches, integral: _GyroscopeIntegral, frame: Rotation, kept: Flags
+    stretches: _Stretches, integral: RotationsAt, frame: Rotation, kept: Flags
 ) -> tuple[Floats, Floats]:
     """Derivatives (N, 3, 7) of the residuals by alignment, bias and latency, and the residuals (N, 3), rad.
 
@@ -258,30 +278,41 @@ class _Solution(NamedTuple):
     scatter: float
 
 
-def _solve(stretches: _Stretches, columns: Floats, off: Floats, kept: Flags) -> _Solution:
-    """Least squares with the prior, and its cluster-robust covariance, one cluster a stretch."""
+def _solve(
+    stretches: _Stretches, columns: Floats, tracked: Floats, off: Floats, kept: Flags
+) -> _Solution:
+    """Least squares with the prior, and its cluster-robust covariance, one cluster a stretch.
+
+    The derivatives by the alignment are rotations by the gyroscope, whose noise looks like information
+    about an axis that the motion leaves open. The covariance has those by the tracker, `tracked`
+    (N, 3, 3), as instruments: the noise of both is independent and cancels in their product.
+    """
     width = columns.shape[2]
     prior = 1.0 / np.square(_PRIOR[:width])
     used = columns * kept[:, None, None]
     count = 3.0 * (kept.sum() - len(stretches.begin)) - width
     square, rhs = np.einsum("nij,nik->jk", used, columns), np.einsum("nij,ni->j", used, off)
 
-    def solved(about: Floats) -> tuple[float, Floats, Floats]:
-        """Variance of the residuals, inverse information and step."""
+    def solved(about: Floats) -> tuple[float, Floats]:
+        """Variance of the residuals, and step."""
         variance = max(float(np.sum(np.square(about[kept]))) / max(count, 1.0), 1e-20)
-        inverse = np.linalg.inv(square / variance + np.diag(prior))
-        return variance, inverse, -inverse @ rhs / variance
+        return variance, -np.linalg.solve(square / variance + np.diag(prior), rhs / variance)
 
     # The initial values may be far off, so the variance is that after a first step.
-    residual = off + columns @ solved(off)[2]
-    variance, inverse, step = solved(residual)
+    residual = off + columns @ solved(off)[1]
+    variance, step = solved(residual)
     residual = off + columns @ step
-    score = np.einsum("nij,ni->nj", used, residual) / variance
+    instruments = used.copy()
+    instruments[:, :, :3] = stretches.remove_mean(tracked, kept) * kept[:, None, None]
+    inverse = np.linalg.inv(
+        np.einsum("nij,nik->jk", instruments, columns) / variance + np.diag(prior)
+    )
+    score = np.einsum("nij,ni->nj", instruments, residual) / variance
     score = np.add.reduceat(score, stretches.begin, axis=0)
     clusters = len(stretches.begin)
     middle = score.T @ score * clusters / max(clusters - width, 1) + np.diag(prior)
     cov = np.diag(np.square(_PRIOR))
-    cov[:width, :width] = inverse @ middle @ inverse
+    cov[:width, :width] = inverse @ middle @ inverse.T
     whole = np.zeros(8)
     whole[:width] = step
     return _Solution(whole, cov, residual, float(np.sqrt(variance)))

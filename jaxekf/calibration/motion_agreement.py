@@ -1,7 +1,7 @@
-"""Agreement of a tracker and an IMU in rotation and translation, from a subset of the samples.
+"""Agreement of a tracker and an IMU in rotation, from a subset of the samples.
 
 `relative_rotations` pairs rotations of the tracker with the integrated rate of the gyroscope, `fit` finds
-the rotation and scale between them, `acceleration_fit` compares the tracker's path with the accelerometer.
+the rotation and scale between them; `acceleration_agreement` does the same for translation.
 The functions measure and do not judge; a quantity that the data do not determine is NaN. They use NumPy and
 SciPy only.
 """
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxekf._support.deprecations import renamed
+from jaxekf.calibration._gyroscope_integral import GyroscopeIntegral
 from jaxekf.geometry.host_rotation import nearest_rotation
 from jaxekf.recordings.accounts import Indices
 from jaxekf.recordings.types import (
@@ -19,9 +20,7 @@ from jaxekf.recordings.types import (
     Flags,
     Floats,
     Imu,
-    Optical,
     Times,
-    period_ns,
     to_scipy,
 )
 
@@ -33,19 +32,25 @@ _PAIRS = 4000
 """Pairs of samples that are compared, spread over the run."""
 _SEARCHED = 1500
 """Pairs among them that the lag search uses."""
-_SPANS_S = (0.1, 0.4, 1.0)
+SPANS_S = (0.1, 0.4, 1.0)
 """Time spans, s, of a relative rotation, tried in turn until the rotations are clear."""
-_CLEAR_ROTATION = np.deg2rad(5.0)
+CLEAR_ROTATION = np.deg2rad(5.0)
 """A rotation well above a tracker's noise, rad; for slower motion the next longer span is tried."""
+_LARGEST_ROTATION = np.deg2rad(115.0)
+"""Rotation, rad, up to which a pair is plainly below half a turn: fast motion is compared over shorter
+spans, down to neighbouring samples."""
+_HALF_TURN = np.deg2rad(165.0)
+"""Rotation, rad, from which on a pair may have turned by half a turn, which shows as less."""
+_ADDED = np.deg2rad(30.0)
+"""Rotation, rad, up to which the sum of the rates is near enough to their ordered product."""
+_DEGREES = 180.0 / np.pi
+_SAME, _RIGHT = 0.1, 0.9
+"""Relative error of a rate ratio, and explained share, up to which both rotate alike."""
+_LONGEST_GAP_S = 0.1
+"""Longest step of the IMU's samples, s, over which rates are interpolated."""
 _OUTLIER_SHARE = 0.1
 """Share of the largest residuals that is left out: wrong poses."""
 _OUTLYING_ROTATION = np.deg2rad(3.0)
-_HALF_WIDTH_S = 0.2
-"""Half the time span of a second difference of positions, s."""
-_NODES = 13
-"""Integration nodes over the span of a second difference."""
-_CENTRES = 1500
-"""Second differences that are compared."""
 
 QuaternionReading = Callable[[Floats], Floats]
 """Takes quaternions (N, 4) as read to those of another component order or direction."""
@@ -68,6 +73,8 @@ class RelativeRotations(NamedTuple):
     """(N, 4) attitudes at the end of each pair."""
     begin_s: Floats
     """(N,) beginning of each pair, s from the IMU's first sample, lag subtracted."""
+    too_fast: bool = False
+    """Whether most pairs turn by about half a turn or more, so that the tracker does not show how fast."""
 
 
 class MotionFit(NamedTuple):
@@ -93,6 +100,13 @@ class Integral:
         self.t = (time_ns - time_ns[0]) / NANOSECONDS
         steps = 0.5 * (values[1:] + values[:-1]) * np.diff(self.t)[:, None]
         self.sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        step = np.diff(self.t)
+        longest = max(_LONGEST_GAP_S, 3.0 * float(np.median(step)) if step.size else 0.0)
+        self.gaps = np.concatenate([[0.0], np.cumsum(np.where(step > longest, step, 0.0))])
+
+    def known(self, begin: Floats, end: Floats) -> Flags:
+        """Mask (N,) of intervals from `begin` to `end` (N,), s, without a gap of the stream."""
+        return np.interp(end, self.t, self.gaps) == np.interp(begin, self.t, self.gaps)
 
     def between(self, begin: Floats, end: Floats) -> Floats:
         """Integral (N, 3) from times `begin` to `end` (N,), s from the first sample."""
@@ -133,7 +147,11 @@ def sample_pairs(
 
 
 def relative_rotations(
-    t: Floats, attitude: Callable[[Indices], Floats], imu: Imu, most: int = _PAIRS
+    t: Floats,
+    attitude: Callable[[Indices], Floats],
+    imu: Imu,
+    most: int = _PAIRS,
+    offset_s: float = 0.0,
 ) -> RelativeRotations | None:
     """Relative rotations of tracker and gyroscope over pairs of samples, at the lag that fits best.
 
@@ -147,6 +165,8 @@ def relative_rotations(
         The IMU's samples.
     most
         Largest number of pairs, about.
+    offset_s
+        Offset of the tracker's clock about which lags are searched, s.
 
     Returns
     -------
@@ -155,11 +175,15 @@ def relative_rotations(
     if len(t) < 2 or len(imu.time_ns) < 2:
         return None
     integral = Integral(imu.time_ns, imu.gyroscope)
+    t = t - offset_s
     step, last = float(np.median(np.diff(t))), float(integral.t[-1])
-    for span_s in _SPANS_S:
+    slow = pair_steps(t, attitude, SPANS_S[-1])
+    for span_s in SPANS_S:
         # Whole steps: samples 80 ms apart are 160 ms apart next, no longer about 100 ms.
-        whole = step * max(1.0, np.ceil(span_s / step - 1e-3))
-        begin, end = sample_pairs(t, whole, last, most)
+        steps = max(1.0, np.ceil(span_s / step - 1e-3))
+        begin, end = sample_pairs(t, step * min(steps, slow), last, most)
+        known = integral.known(t[begin], t[end])
+        begin, end = begin[known], end[known]
         if len(begin) < _FEWEST:
             return None
         rows, where = np.unique(np.concatenate([begin, end]), return_inverse=True)
@@ -167,18 +191,96 @@ def relative_rotations(
         first, second = q[: len(begin)], q[len(begin) :]
         tracked = rotation_vectors(first, second)
         size = np.linalg.norm(tracked, axis=1)
-        if span_s == _SPANS_S[-1] or np.quantile(size, 0.9) > _CLEAR_ROTATION:
+        longest = span_s == SPANS_S[-1] or steps >= slow
+        if longest or np.quantile(size, 0.9) > CLEAR_ROTATION:
             lag = _lag(t[begin], t[end], size, integral)
             integrated = integral.between(t[begin] - lag, t[end] - lag)
+            duration = t[end] - t[begin]
+            lag_s = offset_s + lag
             return RelativeRotations(
-                tracked, integrated, t[end] - t[begin], lag, first, second, t[begin] - lag
+                tracked, integrated, duration, lag_s, first, second, t[begin] - lag
             )
     return None
+
+
+def pair_steps(t: Floats, attitude: Callable[[Indices], Floats], span_s: float) -> int:
+    """Sampling periods of a time span, but few enough that nearly all rotations stay below half a turn.
+
+    Parameters
+    ----------
+    t, attitude
+        As for `relative_rotations`.
+    span_s
+        Time span, s.
+    """
+    step = float(np.median(np.diff(t)))
+    # Whole steps: samples 80 ms apart are 160 ms apart next, no longer about 100 ms.
+    steps = max(1, int(np.ceil(span_s / step - 1e-3)))
+    begin = np.flatnonzero(np.diff(t) <= 1.5 * step)
+    begin = begin[:: max(1, -(-len(begin) // _SEARCHED))]
+    if len(begin) < _FEWEST:
+        return steps
+    size = np.linalg.norm(rotation_vectors(attitude(begin), attitude(begin + 1)), axis=1)
+    return min(steps, max(1, int(_LARGEST_ROTATION / max(np.quantile(size, 0.98), 1e-6))))
+
+
+def compose(rotations: RelativeRotations, imu: Imu, rate_ratio: float) -> RelativeRotations:
+    """The gyroscope's rotations as ordered products of its small rotations, for fast motion.
+
+    The sum of the rates differs from the rotation where the axis of fast rotation changes. A product needs
+    the right unit: the stated one, or degrees and radians exchanged, is taken where its products are the
+    tracker's rotations, which holds beyond half a turn, too; else the rates over `rate_ratio`.
+
+    Parameters
+    ----------
+    rotations
+        Result of `relative_rotations`.
+    imu
+        The IMU's samples.
+    rate_ratio
+        Rate of the gyroscope over that of the tracker, from the sums.
+
+    Returns
+    -------
+    Without the pairs of half a turn or more, if others remain; the same rotations if they are small.
+    """
+    turned = np.linalg.norm(rotations.tracker, axis=1)
+    if np.quantile(turned, 0.98) < _ADDED:
+        return rotations
+    for ratio in (1.0, _DEGREES, 1.0 / _DEGREES):
+        product = _products(rotations, imu, ratio)
+        found = fit(rotations.tracker, product)
+        if found.explained > _RIGHT and abs(found.rate_ratio / ratio - 1.0) < _SAME:
+            break
+    else:
+        if np.median(turned) > _HALF_TURN / 3.0:
+            return rotations._replace(too_fast=True)
+        if not 0.0 < rate_ratio < np.inf:
+            return rotations
+        product, ratio = _products(rotations, imu, rate_ratio), rate_ratio
+    clear = np.linalg.norm(rotations.gyroscope, axis=1) < ratio * _HALF_TURN
+    made = rotations._replace(gyroscope=product)
+    if np.mean(clear) < 0.5 or clear.sum() < _FEWEST:
+        return made._replace(too_fast=ratio == 1.0)
+    fields = {name: value[clear] for name, value in made._asdict().items() if np.ndim(value) > 0}
+    return made._replace(**fields)
+
+
+def _products(rotations: RelativeRotations, imu: Imu, ratio: float) -> Floats:
+    known = (imu.time_ns - imu.time_ns[0]) / NANOSECONDS
+    begin, duration = rotations.begin_s, rotations.duration_s
+    made = GyroscopeIntegral(known, imu.gyroscope / ratio).rotation(begin, begin + duration)
+    return made.as_rotvec() * ratio
 
 
 def rotation_vectors(first: Floats, second: Floats) -> Floats:
     """Rotation vectors (N, 3), rad, from attitudes `first` to `second` (N, 4), in the body frame."""
     return (to_scipy(first).inv() * to_scipy(second)).as_rotvec()
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Angles (N,), rad, of one turn or more as a rotation shows them: 0 to pi."""
+    return np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def outlying_poses(q: Floats) -> Flags:
@@ -204,11 +306,30 @@ def _lag(begin: Floats, end: Floats, size: Floats, integral: Integral) -> float:
     sizes = np.stack([np.minimum(size[few], np.quantile(size, most)) for most in (0.9, 0.98)])
     room = min(LARGEST_LAG_S, 0.1 * float(integral.t[-1]))
 
-    def gyroscope_angle(lag: float) -> Floats:
-        return np.linalg.norm(integral.between(begin - lag, end - lag), axis=1)
+    def correlation(lag: float, *, turned: bool) -> float:
+        angle = np.linalg.norm(integral.between(begin - lag, end - lag), axis=1)
+        return correlate(sizes, wrapped(angle) if turned else angle)
 
-    coarse = best_lag(sizes, gyroscope_angle, np.arange(-room, room + 0.01, 0.02))
-    return best_lag(sizes, gyroscope_angle, coarse + np.arange(-0.02, 0.021, 0.005))
+    def search(lags: Floats, *, turned: bool) -> tuple[float, float]:
+        best = max((correlation(lag, turned=turned), -abs(lag), lag) for lag in lags)
+        return best[0], float(best[2])
+
+    coarse = np.arange(-room, room + 0.01, 0.02)
+    best, turned = search(coarse, turned=False), False
+    if np.quantile(np.linalg.norm(integral.between(begin, end), axis=1), 0.9) > _HALF_TURN:
+        # Either the unit is wrong or the tracker shows more than half a turn as less.
+        other = search(coarse, turned=True)
+        best, turned = (other, True) if other[0] > best[0] else (best, False)
+    return float(search(best[1] + np.arange(-0.02, 0.021, 0.005), turned=turned)[1])
+
+
+def correlate(signals: Floats, other: Floats) -> float:
+    """Largest correlation coefficient of signals (K, N) with another one (N,); -inf for a constant one."""
+    signals = signals - signals.mean(axis=1, keepdims=True)
+    signals /= np.maximum(np.linalg.norm(signals, axis=1, keepdims=True), 1e-12)
+    other = other - other.mean()
+    norm = float(np.sqrt(np.sum(np.square(other))))
+    return float(np.max(signals @ other)) / norm if norm > 0.0 else -np.inf
 
 
 def best_lag(signals: Floats, delayed: Callable[[float], Floats], lags: Floats) -> float:
@@ -227,16 +348,7 @@ def best_lag(signals: Floats, delayed: Callable[[float], Floats], lags: Floats) 
     -------
     The lag of the largest correlation coefficient; the smallest lag where the other signal is constant.
     """
-    signals = signals - signals.mean(axis=1, keepdims=True)
-    signals /= np.maximum(np.linalg.norm(signals, axis=1, keepdims=True), 1e-12)
-
-    def correlation(lag: float) -> float:
-        other = delayed(lag)
-        other = other - other.mean()
-        norm = float(np.sqrt(np.sum(np.square(other))))
-        return float(np.max(signals @ other)) / norm if norm > 0.0 else -np.inf
-
-    return float(max(lags, key=lambda lag: (correlation(lag), -abs(lag))))
+    return float(max(lags, key=lambda lag: (correlate(signals, delayed(lag)), -abs(lag))))
 
 
 def fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
@@ -252,6 +364,23 @@ def fit(tracker: Floats, gyroscope: Floats) -> MotionFit:
     off = np.linalg.norm(tracker - gyroscope @ found.frame.T / found.rate_ratio, axis=1)
     kept = off <= np.quantile(off, 1.0 - _OUTLIER_SHARE)
     return _motion_fit(tracker[kept], gyroscope[kept])
+
+
+def rotation_agreement(
+    t: Floats, attitude: Callable[[Indices], Floats], imu: Imu, offset_s: float
+) -> tuple[float, float]:
+    """Lag near a clock offset, s, and the share of the rotation that the gyroscope explains there.
+
+    Parameters
+    ----------
+    t, attitude, imu, offset_s
+        As for `relative_rotations`.
+    """
+    rotations = relative_rotations(t, attitude, imu, _SEARCHED, offset_s)
+    if rotations is None:
+        return offset_s, 0.0
+    rotations = compose(rotations, imu, 1.0)
+    return rotations.lag_s, fit(rotations.tracker, rotations.gyroscope).explained
 
 
 def limiting_weights(vectors: Floats, quantile: float) -> Floats:
@@ -287,100 +416,10 @@ def second_axis_share(vectors: Floats) -> float:
     return float(values[1] / values[2]) if values[2] > 0.0 else 0.0
 
 
-class AccelerationFit(NamedTuple):
-    """Agreement of the accelerations of a tracker and an accelerometer."""
-
-    ratio: float
-    """Acceleration of the tracker over that of the accelerometer."""
-    correlation: float
-    """Correlation coefficient of the two, all axes together."""
-    acceleration: float
-    """Root mean square of the tracker's acceleration, in its unit of length / s^2."""
-
-
-def acceleration_fit(
-    optical: Optical, imu: Imu, lag_s: float, frame: Floats
-) -> AccelerationFit | None:
-    """The tracker's second differences over 0.2 s against the accelerometer's double integral.
-
-    ``p(t + T) - 2 p(t) + p(t - T)`` is the integral of ``(T - |s|) a(t + s)``; gravity is constant
-    and cancels with the mean.
-
-    Parameters
-    ----------
-    optical, imu
-        Streams with positions and specific forces.
-    lag_s
-        Lag to subtract from the tracker's time stamps, s.
-    frame
-        (3, 3) rotation matrix, IMU frame to tool frame.
-
-    Returns
-    -------
-    None if a stream lacks positions or specific forces, or if too few differences can be formed.
-    """
-    if optical.position is None or imu.accelerometer is None or len(imu.time_ns) < 2:
-        return None
-    usable = optical.valid & np.isfinite(optical.position).all(axis=1)
-    rows = np.flatnonzero(usable)
-    if len(rows) < _FEWEST:
-        return None
-    t = (optical.time_ns[rows] - optical.latency_ns - imu.time_ns[0]) / NANOSECONDS - lag_s
-    integral = Integral(imu.time_ns, imu.accelerometer)
-    inside = (t >= _HALF_WIDTH_S + 0.05) & (t <= integral.t[-1] - _HALF_WIDTH_S - 0.05)
-    centre = t[inside][:: max(1, -(-int(inside.sum()) // _CENTRES))]
-    nodes = np.linspace(-_HALF_WIDTH_S, _HALF_WIDTH_S, _NODES)
-    at = centre[:, None] + nodes
-    after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
-    near = np.where(at - t[after - 1] < t[after] - at, after - 1, after)
-    closed = t[after] - t[after - 1] <= 2.5 * period_ns(optical.time_ns) / NANOSECONDS
-    good = closed.all(axis=1)
-    if good.sum() < _FEWEST:
-        return None
-    at, near = at[good], near[good]
-    width = 0.5 * (nodes[1] - nodes[0])
-    flat = at.ravel()
-    force = integral.between(flat - width, flat + width) / (2.0 * width) @ frame.T
-    force = to_scipy(optical.q_ref_body[rows][near.ravel()]).apply(force).reshape(*at.shape, 3)
-    weight = _HALF_WIDTH_S - np.abs(nodes)
-    force = np.einsum("nji,j->ni", force, weight / weight.sum())
-    path = optical.position[rows]
-    where = np.stack([np.interp(at[:, [0, _NODES // 2, -1]], t, path[:, i]) for i in range(3)], 2)
-    acceleration = (where[:, 2] - 2.0 * where[:, 1] + where[:, 0]) / _HALF_WIDTH_S**2
-    return _fit_accelerations(acceleration, force)
-
-
-def mean_force(rotations: RelativeRotations, imu: Imu, frame: Floats) -> Floats:
-    """Mean specific force (3,), m/s^2, in the reference frame, opposite to gravity whatever the motion.
-
-    Returns NaN without an accelerometer.
-    """
-    if imu.accelerometer is None:
-        return np.full(3, np.nan)
-    integral = Integral(imu.time_ns, imu.accelerometer)
-    width = 0.05
-    force = integral.between(rotations.begin_s - width, rotations.begin_s + width) / (2.0 * width)
-    return to_scipy(rotations.q_begin).apply(force @ frame.T).mean(axis=0)
-
-
-def _fit_accelerations(acceleration: Floats, force: Floats) -> AccelerationFit:
-    one, other = acceleration - np.median(acceleration, axis=0), force - np.median(force, axis=0)
-    # Wrong poses cause large differences.
-    size = np.linalg.norm(one, axis=1)
-    kept = size <= np.quantile(size, 1.0 - _OUTLIER_SHARE)
-    one, other = one[kept] - one[kept].mean(axis=0), other[kept] - other[kept].mean(axis=0)
-    shared = float(np.sum(one * other))
-    squares = float(np.sum(one**2)), float(np.sum(other**2))
-    if min(squares) <= 0.0:
-        return AccelerationFit(np.nan, 0.0, 0.0)
-    size = float(np.sqrt(squares[0] / len(one)))
-    return AccelerationFit(shared / squares[1], shared / np.sqrt(squares[0] * squares[1]), size)
-
-
 __getattr__ = renamed(
     __name__,
-    "Distance>AccelerationFit Fit>MotionFit Reading>QuaternionReading Turns>RelativeRotations "
-    "distance>acceleration_fit pairs_of>sample_pairs readings>fit_readings "
+    "Fit>MotionFit Reading>QuaternionReading Turns>RelativeRotations "
+    "pairs_of>sample_pairs readings>fit_readings "
     "second_axis>second_axis_share strays>outlying_poses turn_between>rotation_vectors "
     "turns>relative_rotations",
 )

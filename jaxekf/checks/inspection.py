@@ -3,7 +3,7 @@
 `inspect` gathers the findings for `jaxekf check`; its verdict is ``fine``, ``warnings`` or ``faults``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,9 @@ from jaxekf.calibration.alignment import (
     has_drift,
     has_latency,
     misalignment_deg,
+    unobservable_turn,
 )
+from jaxekf.calibration.clock_step import ClockStepError, common_jump
 from jaxekf.checks._camera_agreement import (
     CameraEvidence,
     camera_evidence,
@@ -164,10 +166,17 @@ def inspect(recording: Recording) -> Inspection:
             aligned = align_run(recording)
         except RecordingError as error:
             warnings.append(f"clock and frame could not be estimated: {error}")
+            if isinstance(error, ClockStepError):
+                found = replace(found, clock_steps=True, rate_ratio=np.nan, explained=np.nan)
+    if aligned is not None and (turn := unobservable_turn(aligned.tracker.alignment_cov)):
+        notes.append(turn)
     for label in streams:
         _add_row_accounts(recording, label, warnings, notes)
     notes += _unread_files(recording)
-    warnings += _timing_warnings(streams, found)
+    jump = None
+    if recording.optical is not None and recording.imu is not None:
+        jump = common_jump(recording.optical, recording.imu)
+    warnings += _timing_warnings(streams, found, jump)
     warnings += [] if aligned is None else _clock_warnings(aligned)
     warnings += [] if faults else _unit_warnings(recording, found)
     warnings += [] if faults or images is None else camera_warnings(images)
@@ -299,9 +308,13 @@ def _add_row_accounts(
         (notes if name.startswith((*_EXPECTED, *_LAYOUT)) else warnings).append(text)
 
 
-def _timing_warnings(streams: dict[str, StreamSummary], found: Evidence) -> list[str]:
+def _timing_warnings(
+    streams: dict[str, StreamSummary], found: Evidence, jump: str | None
+) -> list[str]:
     warnings = []
     imu = streams.get("imu")
+    if jump is not None:
+        return [f"{jump}; the run is cut there and each part estimated by itself"]
     long = [b - a for a, b in imu.gaps.spans if b - a > _LONG_IMU_GAP_S] if imu else []
     if long:
         warnings.append(
@@ -328,14 +341,17 @@ def _clock_warnings(aligned: RunAlignment) -> list[str]:
     match = aligned.tracker
     warnings = list(aligned.notes)
     if has_latency(match) and not has_drift(match):
+        age = "older" if match.latency_s > 0.0 else "newer"
         warnings.append(
-            f"the tracker's samples are {1e3 * match.latency_s:.1f} ms older than stamped, by the IMU's"
-            " clock: jaxekf align writes a calibration that corrects it"
+            f"the tracker's samples are {1e3 * abs(match.latency_s):.1f} ms {age} than stamped, by the"
+            " IMU's clock: jaxekf align writes a calibration that corrects it"
         )
     if (misaligned := misalignment_deg(match)) is not None:
+        partly = unobservable_turn(match.alignment_cov) is not None
+        part = ", the turn about the axis of rotation left out" if partly else ""
         warnings.append(
-            f"the tool frame is rotated by {misaligned[0]:.1f} deg relative to the IMU's: jaxekf align"
-            " writes a calibration that corrects it"
+            f"the tool frame is rotated by {misaligned[0]:.1f} deg relative to the IMU's{part}: jaxekf"
+            " align writes a calibration that corrects it"
         )
     return warnings
 
@@ -349,7 +365,8 @@ def _unit_warnings(recording: Recording, found: Evidence) -> list[str]:
         warnings.append(
             f"the accelerometer reads {found.static_norm:.2f} m/s^2 at rest; gravity is {gravity:.2f}"
         )
-    if abs(found.rate_ratio - 1.0) > _RATE_OFF:
+    # Noise of slow motion makes the gyroscope seem faster, by the share that is not common.
+    if abs(found.rate_ratio - 1.0) > _RATE_OFF + (1.0 - found.rate_correlation**2):
         warnings.append(
             f"the gyroscope rotates {found.rate_ratio:.3f} times as fast as the tracker"
         )

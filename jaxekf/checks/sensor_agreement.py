@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxekf.calibration import motion_agreement
+from jaxekf.calibration import acceleration_agreement, clock_offset, motion_agreement
 from jaxekf.calibration.motion_agreement import MotionFit, RelativeRotations
 from jaxekf.pose_solvers.marker_pose import from_markers
 from jaxekf.recordings.accounts import Indices
@@ -25,6 +25,8 @@ DEGREES = 180.0 / np.pi
 _WINDOWS, _QUIETEST = 200, 5
 _MARKER_PAIRS = 1500
 _FRAMES = 2000
+_NEAR_S = 0.45
+"""Lag, s, beyond which it may be on the bound of the search without an offset."""
 _ORDERS = {"w,x,y,z": "x,y,z,w", "x,y,z,w": "w,x,y,z"}
 
 
@@ -41,12 +43,18 @@ class Evidence:
     1."""
     lag_s: float = np.nan
     """Lag of the tracker to 5 ms, s; `jaxekf.calibration.alignment` estimates it precisely."""
+    clock_steps: bool = False
+    """Whether a clock steps, so that rates and rotations of the whole run cannot be compared."""
+    searched_s: float = np.nan
+    """Largest clock offset, s, up to which no offset fits; NaN if one fits, 0 for too little rotation."""
     rate_ratio: float = np.nan
     """Gyroscope's rate over tracker's rate: 1, or 57.3 if deg/s were taken for rad/s."""
     rate_correlation: float = np.nan
     """Correlation of the rotation vectors, for the best reading of the quaternion."""
     explained: float = np.nan
     """Share of the tracker's squared rotation that the gyroscope explains, frames aligned."""
+    too_fast: bool = False
+    """Whether the tool turns by about half a turn or more between samples: no `rate_ratio`."""
     readings: dict[str, MotionFit] = field(default_factory=dict)
     """The same for other readings of the quaternion (component order or direction)."""
     static_norm: float = np.nan
@@ -81,10 +89,13 @@ class Evidence:
             "rate_deg_s": self.rate * DEGREES,
             "second_axis": self.second_axis,
             "lag_s": self.lag_s,
+            "clock_steps": self.clock_steps,
+            "searched_s": self.searched_s,
             "rate_ratio": self.rate_ratio,
             "rate_correlation": self.rate_correlation,
             "explained": self.explained,
             "explained_otherwise": measured,
+            "too_fast": self.too_fast,
             "static_norm": self.static_norm,
             "mean_force": self.mean_force,
             "mean_force_ref": list(self.mean_force_ref),
@@ -112,13 +123,13 @@ def evidence(recording: Recording) -> Evidence:
         valid = tracker.valid.copy()
         valid[rows[motion_agreement.outlying_poses(tracker.q_ref_body[rows])]] = False
         tracker = replace(tracker, valid=valid)
-    rotations = _rotations(tracker, imu)
+    rotations, searched_s = _rotations(recording, tracker, imu)
+    measured["searched_s"] = searched_s
     if rotations is None:
         return Evidence(**measured)
-    stated, others = motion_agreement.fit(rotations.tracker, rotations.gyroscope), {}
-    if isinstance(tracker, Optical):
-        others = motion_agreement.fit_readings(rotations, _other_readings(recording))
+    stated, others = _fits(recording, rotations)
     best = max([stated, *others.values()], key=lambda found: found.explained)
+    alike = np.sqrt(best.explained) > ALIKE and not rotations.too_fast
     measured |= {
         "turns": len(rotations.duration_s),
         "rate": float(
@@ -126,14 +137,15 @@ def evidence(recording: Recording) -> Evidence:
         ),
         "second_axis": motion_agreement.second_axis_share(rotations.gyroscope),
         "lag_s": rotations.lag_s,
-        "rate_ratio": best.rate_ratio if np.sqrt(best.explained) > ALIKE else np.nan,
+        "rate_ratio": best.rate_ratio if alike else np.nan,
         "rate_correlation": float(np.sqrt(best.explained)),
         "explained": stated.explained,
         "readings": others,
+        "too_fast": rotations.too_fast,
     }
     if stated.explained > EXPLAINED:
         measured["mean_force_ref"] = tuple(
-            motion_agreement.mean_force(rotations, imu, stated.frame).tolist()
+            acceleration_agreement.mean_force(rotations, imu, stated.frame).tolist()
         )
     if isinstance(tracker, Optical):
         measured |= _lengths(tracker, imu, rotations, stated)
@@ -164,7 +176,10 @@ def tracker_label(recording: Recording) -> str:
     return "optical" if recording.optical is not None else "markers"
 
 
-def _rotations(tracker: Optical | Markers, imu: Imu) -> RelativeRotations | None:
+def _rotations(
+    recording: Recording, tracker: Optical | Markers, imu: Imu
+) -> tuple[RelativeRotations | None, float]:
+    """Rotations at the clock offset that fits, and the largest offset that was searched without success."""
     posed = isinstance(tracker, Optical)
     rows = np.flatnonzero(tracker.valid if posed else tracker.usable.sum(axis=1) >= 3)
     t = (tracker.time_ns[rows] - tracker.latency_ns - imu.time_ns[0]) / NANOSECONDS
@@ -175,7 +190,40 @@ def _rotations(tracker: Optical | Markers, imu: Imu) -> RelativeRotations | None
         return from_markers(tracker.take(rows[chosen])).q_ref_body
 
     pairs = {} if posed else {"most": _MARKER_PAIRS}
-    return motion_agreement.relative_rotations(t, attitude, imu, **pairs)
+
+    def at(offset_s: float) -> tuple[RelativeRotations | None, float]:
+        found = motion_agreement.relative_rotations(t, attitude, imu, **pairs, offset_s=offset_s)
+        if found is None:
+            return None, 0.0
+        found = motion_agreement.compose(found, imu, _best(recording, found).rate_ratio)
+        return found, _best(recording, found).explained
+
+    def agreement(offset_s: float) -> tuple[float, float]:
+        found, explained = at(offset_s)
+        return (offset_s if found is None else found.lag_s), explained
+
+    near, explained = at(0.0)
+    if explained > EXPLAINED and near is not None and abs(near.lag_s) < _NEAR_S:
+        return near, np.nan
+    search = clock_offset.find(t, attitude, imu, agreement)
+    if search.explained > explained and not np.isnan(search.offset_s):
+        return at(search.offset_s)[0], np.nan
+    return near, np.nan if explained > ALIKE**2 else search.within_s
+
+
+def _best(recording: Recording, rotations: RelativeRotations) -> MotionFit:
+    stated, others = _fits(recording, rotations)
+    return max([stated, *others.values()], key=lambda found: found.explained)
+
+
+def _fits(
+    recording: Recording, rotations: RelativeRotations
+) -> tuple[MotionFit, dict[str, MotionFit]]:
+    """The fit of the quaternions as stated, and those of their other readings."""
+    stated, others = motion_agreement.fit(rotations.tracker, rotations.gyroscope), {}
+    if recording.optical is not None:
+        others = motion_agreement.fit_readings(rotations, _other_readings(recording))
+    return stated, others
 
 
 def _other_readings(recording: Recording) -> dict[str, motion_agreement.QuaternionReading]:
@@ -232,7 +280,7 @@ def marker_ratio(markers: Markers) -> float:
 def _lengths(
     tracker: Optical, imu: Imu, rotations: RelativeRotations, stated: MotionFit
 ) -> dict[str, float]:
-    found = motion_agreement.acceleration_fit(tracker, imu, rotations.lag_s, stated.frame)
+    found = acceleration_agreement.acceleration_fit(tracker, imu, rotations.lag_s, stated.frame)
     if found is None or tracker.position is None:
         return {}
     far = np.linalg.norm(tracker.position[tracker.valid], axis=1)

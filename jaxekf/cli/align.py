@@ -7,6 +7,7 @@ import click
 import numpy as np
 from msgspec import UNSET, Struct
 
+from jaxekf._support.errors import RecordingError
 from jaxekf.calibration.alignment import (
     CombinedAlignment,
     RunAlignment,
@@ -14,7 +15,7 @@ from jaxekf.calibration.alignment import (
     calibration_for,
     combine_runs,
 )
-from jaxekf.calibration.attitude_alignment import AttitudeMatch
+from jaxekf.calibration.attitude_alignment import AttitudeMatch, unobservable_axis
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -25,7 +26,7 @@ from jaxekf.cli.console import (
     print_table,
     sort_option,
 )
-from jaxekf.cli.estimate import load_runs
+from jaxekf.cli.estimate import load_runs, require_different_names
 from jaxekf.estimation import parameters
 from jaxekf.estimation.versions import provenance
 from jaxekf.io.atomic import check_output, whole_folder
@@ -33,7 +34,10 @@ from jaxekf.io.documents import alignment as documents
 from jaxekf.io.documents import codec
 from jaxekf.io.hashes import inputs_of
 from jaxekf.models import get_model
-from jaxekf.recordings.types import Floats
+from jaxekf.recordings.types import Floats, Recording
+
+_SOME_FAILED = 3
+"""Exit status if some runs are left out, that of warnings in `jaxekf check`."""
 
 
 @click.command()
@@ -51,12 +55,12 @@ def align(
     Latency: delay of the tracker's samples in seconds, in the middle of the run, in addition to the
     latency in the recording's description; drift: its growth in ppm. Alignment: tracker-to-IMU rotation
     (extrinsic rotation). The mean of all runs is written as calibration.toml for the model; align.json
-    holds the numbers of each run.
+    holds the numbers of each run. A run that cannot be read or aligned is left out and named, and the exit
+    status is 3; 1 if none is left.
     """
     check_output(output, "align.json", overwrite=overwrite)
     chosen = get_model(model)
-    recordings = load_runs(runs, sort=sort)
-    found = [align_run(recording) for recording in recordings]
+    recordings, found, failed = _align_each(runs, sort=sort)
     mean = combine_runs(found)
     params, sentences = calibration_for(chosen, mean)
     for run in found:
@@ -71,6 +75,7 @@ def align(
         together=documents.MeanAlignment(**_shared(mean, documents.MeanAlignment)),
         calibration=parameters.to_document(chosen, params, {})["calibration"],
         notes=[*mean.sentences(), *sentences],
+        failed=failed,
         provenance=made_of,
     )
     with whole_folder(output, "align.json", overwrite=overwrite) as folder:
@@ -80,8 +85,36 @@ def align(
     note(f"wrote {output / 'calibration.toml'} for {chosen.name}")
     if as_json:
         print_json(codec.plain(document) | {"output": str(output)})
-        return
-    _print(found, mean)
+    else:
+        _print(found, mean)
+    if failed:
+        click.get_current_context().exit(_SOME_FAILED)
+
+
+def _align_each(
+    runs: tuple[Path, ...], *, sort: bool
+) -> tuple[list[Recording], list[RunAlignment], dict[str, str]]:
+    """The runs that can be aligned, their alignments, and the error of each other run by its path.
+
+    Raises the first error if no run is left.
+    """
+    paths, recordings, found, errors = [], [], [], {}
+    for path in runs:
+        try:
+            (recording,) = load_runs([path], sort=sort)
+            made = align_run(recording)
+        except RecordingError as error:
+            errors[str(path)] = error
+            continue
+        paths.append(path)
+        recordings.append(recording)
+        found.append(made)
+    if not found:
+        raise next(iter(errors.values()))
+    require_different_names(paths, recordings)
+    for error in errors.values():
+        note(f"Left out: {error}")
+    return recordings, found, {path: str(error) for path, error in errors.items()}
 
 
 def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:
@@ -89,15 +122,15 @@ def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:
     for run in found:
         rows += aligned_rows(run)
     if len(found) > 1:
-        size, axis, sigma = _turn(mean.alignment, mean.alignment_cov)
+        turn, axis = _turn(mean.alignment, mean.alignment_cov)
         latency = _pm(1e3 * mean.latency_s, 1e3 * mean.latency_sigma_s)
         drift = _drift(mean.drift, mean.drift_sigma)
-        rows.append(["mean", "tracker", latency, drift, _pm(size, sigma), axis, ""])
+        rows.append(["mean", "tracker", latency, drift, turn, axis, ""])
     print_table("Against the IMU, with standard deviations", alignment_columns(), rows)
     if len(found) > 1:
         click.echo(
             f"Do the runs agree? latency: chi-square {mean.latency_chi2:.1f} of {mean.runs - 1},"
-            f" p = {mean.latency_p:.2g}; alignment: {mean.alignment_chi2:.1f} of {3 * mean.runs - 3},"
+            f" p = {mean.latency_p:.2g}; alignment: {mean.alignment_chi2:.1f} of {mean.alignment_freedom},"
             f" p = {mean.alignment_p:.2g}"
         )
 
@@ -125,24 +158,28 @@ def aligned_rows(found: RunAlignment) -> list[list[Any]]:
 
 def aligned_row(run: str, stream: str, made: AttitudeMatch) -> list[Any]:
     """One stream of a run, a row of the table."""
-    size, axis, sigma = _turn(made.alignment, made.alignment_cov)
+    turn, axis = _turn(made.alignment, made.alignment_cov)
     return [
         run,
         stream,
         _pm(1e3 * made.latency_s, 1e3 * made.latency_sigma_s),
         _drift(made.drift, made.drift_sigma),
-        _pm(size, sigma),
+        turn,
         axis,
         ", ".join(f"{value:+.3f}" for value in np.rad2deg(made.bias)),
     ]
 
 
-def _turn(alignment: Floats, cov: Floats) -> tuple[float, str, float]:
-    """Size in degrees, axis in words, and the deviation about that axis in degrees."""
-    size = float(np.linalg.norm(alignment))
-    axis = alignment / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
+def _turn(alignment: Floats, cov: Floats) -> tuple[str, str]:
+    """Size with its deviation, degrees, and axis in words; without a turn about an unobservable axis."""
+    size, unknown = float(np.linalg.norm(alignment)), unobservable_axis(cov)
+    axis = alignment / size if size > 0.0 else np.linalg.eigh(cov)[1][:, 0]
     sigma = float(np.rad2deg(np.sqrt(axis @ cov @ axis)))
-    return float(np.rad2deg(size)), ", ".join(f"{value:+.2f}" for value in axis), sigma
+    about = ", ".join(f"{value:+.2f}" for value in axis)
+    if unknown is None:
+        return _pm(float(np.rad2deg(size)), sigma), about
+    across = ", ".join(f"{value + 0.0:+.2f}" for value in np.round(unknown, 2))
+    return f"{_pm(float(np.rad2deg(size)), sigma)}\nunobservable", f"{about}\n{across}"
 
 
 def _drift(drift: float, sigma: float) -> str:
@@ -178,4 +215,8 @@ def _shared(made: AttitudeMatch | CombinedAlignment, kind: type[Struct]) -> dict
     }
     sigma = np.sqrt(np.diagonal(made.alignment_cov))
     degrees = {"alignment_deg": made.alignment, "alignment_sigma_deg": sigma}
+    axis = unobservable_axis(made.alignment_cov)
+    if axis is not None:
+        found["unobservable_axis"] = axis
+        degrees["alignment_sigma_deg"] = np.where(sigma > 1.0, np.nan, sigma)
     return found | {name: np.rad2deg(value) for name, value in degrees.items()}

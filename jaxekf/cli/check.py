@@ -220,9 +220,21 @@ def _evidence(found: Evidence, tracker: str = "tracker") -> list[str]:
             f"rate: the gyroscope turns {found.rate_ratio:.3f} times as fast as the {tracker} (correlation"
             f" {found.rate_correlation:.2f})"
         )
+    elif found.clock_steps:
+        lines.append("rate: not compared, since a clock steps")
+    elif found.too_fast:
+        lines.append(
+            f"rate: about half a turn or more between the {tracker}'s samples: too fast for its rate to"
+            " determine the gyroscope's unit"
+        )
+    elif found.searched_s > 0.0:
+        lines.append(
+            f"rate: the rotations of gyroscope and {tracker} agree at no clock offset within"
+            f" ±{found.searched_s:.0f} s"
+        )
     elif found.turns:
-        lines.append("rate: too little turning, or too unlike, to determine the gyroscope's unit")
-    if found.readings and tracker == "tracker":
+        lines.append("rate: too little turning to determine the gyroscope's unit")
+    if found.readings and tracker == "tracker" and not found.clock_steps:
         others = max(made.explained for made in found.readings.values())
         lines.append(
             f"quaternion: the gyroscope explains {100.0 * found.explained:.1f} % of the turning, with"

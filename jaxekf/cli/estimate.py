@@ -66,12 +66,7 @@ def load_runs(
     for path in paths:
         with memory.for_runs([path.name]):
             recordings.append(run_folder.load(path, sort=sort))
-    names = [recording.name for recording in recordings]
-    for path, name in zip(paths, names, strict=True):
-        if names.count(name) > 1:
-            raise RecordingError(
-                path, f"the name '{name}' twice", "runs with different names", "renaming one"
-            )
+    require_different_names(paths, recordings)
     for recording in recordings:
         for label, account in recording.intake.items():
             for text in account.sentences(label):
@@ -79,6 +74,16 @@ def load_runs(
     if model is None or model.input is None:
         return recordings
     return [part for recording in recordings for part in _parts(recording)]
+
+
+def require_different_names(paths: Sequence[Path], recordings: Sequence[Recording]) -> None:
+    """Raise `RecordingError` if two runs have the same name."""
+    names = [recording.name for recording in recordings]
+    for path, name in zip(paths, names, strict=True):
+        if names.count(name) > 1:
+            raise RecordingError(
+                path, f"the name '{name}' twice", "runs with different names", "renaming one"
+            )
 
 
 def _parts(recording: Recording) -> list[Recording]:

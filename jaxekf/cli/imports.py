@@ -60,7 +60,7 @@ def import_run(
     """Convert a recording of another program to a run: jaxekf import FORMAT SRC -o RUN.
 
     Prints the account of every row and all assumptions, which are also in recording.toml. A tracker alone
-    becomes a run by adding its imu.csv, on the same clock or within half a second of it.
+    becomes a run by adding its imu.csv, on the same clock or on one that jaxekf align can match.
     """
     from jaxekf.io import run_folder
 

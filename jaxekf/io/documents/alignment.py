@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Struct, UnsetType, field
 
 from jaxekf.io.documents.codec import Document
 from jaxekf.recordings.types import Floats
@@ -20,8 +20,11 @@ class StreamAlignment(Struct):
     alignment_deg: Floats
     """(3,) rotation vector."""
     alignment_sigma_deg: Floats
+    """Null where an unobservable axis leaves a component open."""
     bias_deg_s: Floats
     scatter_deg: float
+    unobservable_axis: Floats | UnsetType = UNSET
+    """(3,) axis of the tool frame about which all rotation was; the turn about it is left at zero."""
 
 
 class RunAlignment(Struct):
@@ -47,6 +50,7 @@ class MeanAlignment(Struct):
     drift: float
     drift_sigma: float
     start_latency_s: float
+    unobservable_axis: Floats | UnsetType = UNSET
 
 
 class AlignmentDocument(Document, kw_only=True):
@@ -58,4 +62,6 @@ class AlignmentDocument(Document, kw_only=True):
     together: MeanAlignment
     calibration: dict[str, Any]
     notes: list[str]
+    failed: dict[str, str] = field(default_factory=dict)
+    """Errors of the runs that were left out, by path."""
     provenance: dict[str, Any]

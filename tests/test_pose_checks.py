@@ -61,6 +61,15 @@ def test_every_flipped_pose_is_found(kind, angle):
     assert not good.wrong.any() and not good.steps
 
 
+def test_clocks_and_frames_are_found_beside_flips():
+    """Would catch flipped poses that keep check and align from the latency and the rotation of the others."""
+    bad, truth = with_flips(pair(1)[0])
+    made = inspect(bad).alignment
+    assert made is not None and abs(made.tracker.latency_s) < 1e-3
+    assert np.rad2deg(np.linalg.norm(made.tracker.alignment)) < 0.2
+    assert f"{truth.sum()} flipped poses are left out" in made.notes
+
+
 def test_flips_are_a_warning_of_check():
     """Would catch flips that check passes over, or their share and time left out."""
     bad, truth = with_flips(pair(1)[0])

@@ -28,7 +28,7 @@ from jaxekf.checks._camera_agreement import (
 )
 from jaxekf.checks._field_offset import field_findings
 from jaxekf.checks._held_values import held_findings
-from jaxekf.checks._pose_findings import pose_findings
+from jaxekf.checks._pose_findings import pose_findings, without_flips
 from jaxekf.checks._rotation_match import rotation_findings
 from jaxekf.checks._sensor_range import range_findings
 from jaxekf.checks.plausibility import FARTHEST_M, Evidence, check, evidence
@@ -163,7 +163,7 @@ def inspect(recording: Recording) -> Inspection:
         notes.append(f"without {lacking} neither clocks nor units can be compared")
     elif tracked and not faults:
         try:
-            aligned = align_run(recording)
+            aligned = align_good_poses(recording, found)
         except RecordingError as error:
             warnings.append(f"clock and frame could not be estimated: {error}")
             if isinstance(error, ClockStepError):
@@ -195,6 +195,22 @@ def inspect(recording: Recording) -> Inspection:
         _points(recording),
         images,
     )
+
+
+def align_good_poses(recording: Recording, found: Evidence) -> RunAlignment:
+    """`jaxekf.calibration.alignment.align_run` without the poses that are flipped against the gyroscope.
+
+    Raises
+    ------
+    RecordingError
+        As `align_run`.
+    """
+    optical = without_flips(recording, found)
+    if optical is recording.optical or optical is None or recording.optical is None:
+        return align_run(recording)
+    count = int(recording.optical.valid.sum() - optical.valid.sum())
+    made = align_run(recording.replace(optical=optical))
+    return made._replace(notes=(*made.notes, f"{count} flipped poses are left out"))
 
 
 def _unread_files(recording: Recording) -> list[str]:

@@ -16,6 +16,8 @@ from jaxekf.calibration.alignment import (
     combine_runs,
 )
 from jaxekf.calibration.attitude_alignment import AttitudeMatch, unobservable_axis
+from jaxekf.checks.inspection import align_good_poses
+from jaxekf.checks.sensor_agreement import evidence
 from jaxekf.cli.console import (
     json_option,
     model_option,
@@ -102,7 +104,7 @@ def _align_each(
     for path in runs:
         try:
             (recording,) = load_runs([path], sort=sort)
-            made = align_run(recording)
+            made = _align_one(recording)
         except RecordingError as error:
             errors[str(path)] = error
             continue
@@ -115,6 +117,14 @@ def _align_each(
     for error in errors.values():
         note(f"Left out: {error}")
     return recordings, found, {path: str(error) for path, error in errors.items()}
+
+
+def _align_one(recording: Recording) -> RunAlignment:
+    try:
+        return align_run(recording)
+    except RecordingError:
+        # Flipped poses would be the reason; without them the error is the same.
+        return align_good_poses(recording, evidence(recording))
 
 
 def _print(found: list[RunAlignment], mean: CombinedAlignment) -> None:

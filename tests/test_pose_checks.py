@@ -62,7 +62,7 @@ def test_every_flipped_pose_is_found(kind, angle):
 
 
 def test_clocks_and_frames_are_found_beside_flips():
-    """Would catch flipped poses that keep check and align from the latency and the rotation of the others."""
+    """Would catch flipped poses that keep check and align from clock and frame of the others."""
     bad, truth = with_flips(pair(1)[0])
     made = inspect(bad).alignment
     assert made is not None and abs(made.tracker.latency_s) < 1e-3

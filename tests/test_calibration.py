@@ -148,7 +148,7 @@ def test_parameters_of_each_run_estimate_it(runs, tuned):
         np.testing.assert_array_equal(
             made.params.calibration.alignment, params.calibration.alignment
         )
-    with pytest.raises(ValueError, match="as many as the 2 runs"):
+    with pytest.raises(ValueError, match="one for each of 2 runs"):
         jaxekf.estimate_many(runs[:2], "loose", own[:1])
 
 

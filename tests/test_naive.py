@@ -202,8 +202,10 @@ def test_parameters_inside_whole_operations(name, where):
         linear,
         transition=lambda x, u, dt, w, params: plain["transition"](x, params.calibration.c) + w,
         sensors=(sensor,),
+        parameters=linear.parameters._replace(calibration=Tuned(0.7)),
+        units=linear.units._replace(calibration=Tuned("1")),
     )
-    params = model.parameters._replace(calibration=Tuned(jnp.asarray(0.7)))
+    params = jax.tree.map(jnp.asarray, model.parameters)
     belief = Belief(jnp.array([0.4, 0.5, 0.6]), jnp.eye(3))
     value = np.random.default_rng(2).uniform(0.2, 1.0, (5, 1, 3))
     one = np.ones((5, 1))

@@ -220,18 +220,26 @@ def test_real_lag_of_the_gyroscope(data_dir):
     assert abs(rough.latency_s - exact.latency_s) < 4.0 * rough.latency_sigma_s
 
 
+TRACKERS_CLOCK = {"encoder_about": {"clock": "tracker"}}
+"""Truth from the tracker itself, such as by its other cameras."""
+
+
 def tool_run(seed, turn):
     """A tool whose tracker reports whole poses, of a frame turned in the body, later than it says."""
     motion = marker_runs.free_tool_motion(seed)
     run = marker_runs.tool_recording("tool", motion, seed=seed, duration_s=20.0)
     optical = late(poses(run), latency_s=0.06, turn=turn)
-    return run.replace(optical=optical, markers=None, encoder=late(run.need_encoder(), 0.06))
+    encoder = late(run.need_encoder(), 0.06)
+    return run.replace(
+        optical=optical, markers=None, encoder=encoder, info={**run.info, **TRACKERS_CLOCK}
+    )
 
 
 def turning_run(seed, turn):
     """Attitudes and truth of a frame that is turned in the body and lies on the tracker's clock."""
     run = planted(seed, 20.0, latency_s=0.06, turn=turn)
-    return run.replace(encoder=late(run.need_encoder(), 0.06, turn=turn))
+    encoder = late(run.need_encoder(), 0.06, turn=turn)
+    return run.replace(encoder=encoder, info={**run.info, **TRACKERS_CLOCK})
 
 
 @pytest.mark.parametrize(("name", "make"), [("loose", turning_run), ("loose_pose", tool_run)])

@@ -258,8 +258,8 @@ def wrong_poses(seed, angle_deg, length_s, speed_deg=40.0):
 @pytest.mark.parametrize(
     ("method", "smooth"),
     scenario.long_form(
-        [(method, smooth) for method in OUTLIER_METHODS for smooth in (False, True)],
-        {(method, True) for method in ("huber", "student", "none")},
+        [(method, smooth) for method in OUTLIER_METHODS[:3] for smooth in (False, True)],
+        {(method, True) for method in ("huber", "student")},
     ),
 )
 def test_back_within_a_second_of_right_poses(method, smooth):

@@ -282,10 +282,7 @@ POINTS = Model(
 
 
 def linear_model(transition, input_noise, slopes, noises, gate=None):
-    """A time-invariant linear system ``x+ = A x + w``, ``z = H x + v``; one sensor for each H.
-
-    Without a gate it is never reset either: the plain Kalman filter, whatever the data.
-    """
+    """A time-invariant linear system ``x+ = A x + w``, ``z = H x + v``; one sensor for each H."""
 
     def sensor(i, h, r):
         return Sensor(
@@ -309,7 +306,6 @@ def linear_model(transition, input_noise, slopes, noises, gate=None):
         noise_dims=Empty(),
         initial_mean=lambda first: jnp.zeros(n),
         initial_covariance=lambda params: jnp.eye(n),
-        gate_reset_after_s=np.inf if gate is None else 0.5,
     )
 
 

@@ -2,9 +2,9 @@
 
 Gates and weights assume that the belief is right and a sample may be wrong. If all samples of some
 sensors are outside their chi-square bounds for `Model.gate_reset_after_s`, the belief is taken to be
-wrong, whatever the outlier method: process noise is added to it at once, and the sample is used with
-full weight. The noise opens the states that these sensors observe. The other states, such as biases,
-get at most the variance of the start.
+wrong: process noise is added to it at once, and the sample is used with full weight. The noise opens the
+states that these sensors observe. The other states, such as biases, get no more than the variance of the
+start behind a gate, and more where wrong samples may have moved them.
 """
 
 from collections.abc import Mapping
@@ -20,6 +20,8 @@ _GROWTH = 99.0
 """Variance that a reset adds to states that the sensors do not observe, as a multiple of theirs, if the
 gates have kept wrong samples from moving them: ten times the deviation."""
 
+_MOST = 1e4
+"""Largest variance that a reset adds without a gate, as a multiple of that at the start."""
 _FEWEST = 6
 """Samples in a row before a reset, at least, from a slow sensor."""
 
@@ -135,7 +137,8 @@ def reset(
         recovered |= {name: here for name in group.sensors if name in tallies}
         # Gates have kept wrong samples from moving the other states; without, all have moved them.
         grown, excess = _GROWTH * prior_cov, tally.excess[None, None]
-        allowed = jnp.minimum(grown, initial) if group.is_gated else grown * excess
+        most = initial if group.is_gated else _MOST * initial
+        allowed = jnp.minimum(grown if group.is_gated else grown * excess, most)
         inside = np.array(group.observed)
         both = np.outer(inside, inside)[..., None]
         opened = jnp.where(both, prior_cov * (excess - 1.0), 0.0)

@@ -107,7 +107,7 @@ def gate_and_weight(
     tallies: dict[str, ResetTally] = {}
     for name, one in linear.items():
         sensor = sensors[name]
-        if rejecting_s is None and sensor.gate is None and sensor.weighting is None:
+        if sensor.gate is None and sensor.weighting is None:
             continue
         seen = one, prior_cov
         if sensor.weighting is None:

@@ -116,11 +116,16 @@ class LoweredModel:
 
     @cached_property
     def reset_groups(self) -> tuple[ResetGroup, ...]:
-        """Groups of sensors that can contradict the belief; empty if the model is never reset."""
+        """Groups of the sensors with gates or weights; empty if the model is never reset."""
         if not self.model.gate_reset_after_s < np.inf:
             return ()
-        patterns = {name: lowered.pattern for name, lowered in self.sensors.items()}
-        gated = {n: lowered.sensor.gate is not None for n, lowered in self.sensors.items()}
+        robust = {
+            name: lowered
+            for name, lowered in self.sensors.items()
+            if lowered.sensor.gate is not None or lowered.sensor.weighting is not None
+        }
+        patterns = {name: lowered.pattern for name, lowered in robust.items()}
+        gated = {name: lowered.sensor.gate is not None for name, lowered in robust.items()}
         return find_groups(patterns, gated)
 
 

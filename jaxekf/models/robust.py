@@ -28,8 +28,8 @@ def robust(model: str | Model, outlier_method: OutlierMethod, probability: float
     outlier_method
         ``gate`` rejects samples outside a chi-square bound. ``huber`` and ``student`` reject nothing but
         give samples less weight the larger their innovation is, so that none moves the estimate far.
-        ``none`` gives every sample full weight. With each of them the belief is reset if all samples
-        contradict it for `Model.gate_reset_after_s`.
+        With each of these the belief is reset if all samples contradict it for
+        `Model.gate_reset_after_s`. ``none`` gives every sample full weight.
     probability
         Probability with which a Gaussian sample passes the gate.
 

@@ -45,7 +45,7 @@ def limits(values: Floats) -> list[Limit]:
     >>> import numpy as np
     >>> rate = np.random.default_rng(0).normal(size=(1000, 3))
     >>> [(one.axis, one.value, len(one.at)) for one in limits(np.clip(rate, -2.0, 5.0))]
-    [(0, -2.0, 19), (1, -2.0, 18), (2, -2.0, 27)]
+    [(0, -2.0, 28), (1, -2.0, 12), (2, -2.0, 22)]
     """
     rows = np.flatnonzero(np.isfinite(values).all(axis=1))
     if len(rows) < 20:

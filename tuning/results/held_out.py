@@ -92,7 +92,7 @@ class ParameterSpread(NamedTuple):
     >>> problem = {"objective": "likelihood", "free": ["noise.optical"], "iterations": 2}
     >>> optical = tuning.cross_validate(runs, **problem).parameters["noise.optical"]
     >>> optical.each.shape, f"{optical.mean:.4f} rad", bool(optical.deviation < 0.1 * optical.mean)
-    ((2,), '0.0054 rad', True)
+    ((2,), '0.0052 rad', True)
     """
 
     start: Floats

@@ -7,7 +7,9 @@ states that these sensors observe. The other states, such as biases, get no more
 start behind a gate, and more where wrong samples may have moved them.
 """
 
+import operator
 from collections.abc import Mapping
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -62,7 +64,8 @@ class Resets(NamedTuple):
     @property
     def anywhere(self) -> Array:
         """(lanes,) where any group is reset."""
-        return jnp.stack(list(self.recovered.values())).any(axis=0)
+        nowhere = jnp.zeros(self.rejecting_s.shape[-1], bool)
+        return reduce(operator.or_, self.recovered.values(), nowhere)
 
 
 def find_groups(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaxekf._support.errors import ArgumentError
 
 Refuse = Callable[[str, str, str], Exception]
-"""Makes an error of what was got, what was expected and what to try."""
+"""Builds an error from three texts: the value found, the expected one, and the remedy."""
 Shape = tuple[int | None, ...]
 """The length of each axis; None for any."""
 

@@ -192,7 +192,7 @@ def _offsets(
     jumps: Indices, measured: Floats, turned: Floats, q: Floats, allowed: float, *, body: bool
 ) -> Rotation:
     """Rotations (K + 1,) from the right pose to the reported one in each part of a run that is cut at K
-    jumps, the identity where the angle is within what is allowed.
+    jumps; the identity for angles up to `allowed` (rad).
 
     The wrong rotation is fixed in the body, as with swapped markers, or in the reference.
     """

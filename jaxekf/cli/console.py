@@ -24,7 +24,7 @@ from jaxekf.models.robust import OUTLIER_METHODS
 _SECONDS_BETWEEN_LINES = 10.0
 """Time between two lines on an iteration where there is no bar."""
 _UNLIMITED = 100_000
-"""Width of what is not a terminal."""
+"""Width of a pipe or a file, in characters."""
 
 
 def default_option(name: str, kind: Any, default: Any, contents: str) -> Callable[[Any], Any]:

@@ -186,7 +186,7 @@ def _parameters_per_run(
 def read(runs: Sequence[Run]) -> list[Recording]:
     """The recordings of runs; paths are read from disk.
 
-    Raises `ArgumentError` for one run in place of several, and for what is no run.
+    Raises `ArgumentError` for a single run, and for a value that is neither a path nor a recording.
     """
     if isinstance(runs, Recording | str | os.PathLike) or not isinstance(runs, Iterable):
         raise ArgumentError(

@@ -103,7 +103,7 @@ def _thinned(time_ns: Times, values: Floats, most: int = _MOST) -> tuple[Times, 
 
 
 def _descent(residual: Residual, shift: float) -> tuple[TimeShift, float]:
-    """The shift that Gauss-Newton reaches, and the root mean square of what is left."""
+    """The shift by Gauss-Newton steps, and the root mean square of its residuals."""
     nothing = UNKNOWN, float("inf")
     for _ in range(_STEPS):
         off, columns = residual(shift)

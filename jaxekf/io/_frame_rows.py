@@ -79,7 +79,7 @@ def part_of_each_line(
 ) -> Indices:
     """Index (lines,) into `names` of the part that each line is of, by the name in the column `part`.
 
-    The error of a name that is none of them has what is `expected`, and the remedy of `adding` it.
+    `expected` and `adding` are the texts of the error for an unknown name: expectation and remedy.
     """
     index = {name: i for i, name in enumerate(names)}
     cells = words(table, part)

@@ -109,12 +109,12 @@ def gate_and_weight(
         sensor = sensors[name]
         if sensor.gate is None and sensor.weighting is None:
             continue
-        seen = one, prior_cov
+        seen, cov = one, prior_cov
         if sensor.weighting is None:
             # Gates and resets have no derivative.
-            seen = lax.stop_gradient((one.rows, prior_cov))
-            seen = one._replace(rows=seen[0]), seen[1]
-        distances[name] = _innovation_distances(sensor, *seen)
+            seen = one._replace(rows=lax.stop_gradient(one.rows))
+            cov = lax.stop_gradient(prior_cov)
+        distances[name] = _innovation_distances(sensor, seen, cov)
         outside, ratios[name], tallies[name] = _compare_with_bounds(
             sensor, one.rows.mask, distances[name], samples[name].dt
         )
